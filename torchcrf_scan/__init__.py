@@ -1,0 +1,3 @@
+"""torchcrf_scan."""
+
+__version__ = "0.1.0"

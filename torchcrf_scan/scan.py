@@ -1,0 +1,166 @@
+"""The data that passes through the package: scans, annotated pairs and predictions of one pair.
+
+Frame: x ahead, y left, bearings counter-clockwise, metres, radians, seconds. The first scan of a pair is the `source`, the
+second the `target`; a motion `T_target_source` = (theta, tx, ty) maps source points into the target frame.
+
+Two numberings live side by side. A *beam* is an entry of the arrays that came in, valid or not; a *point* is a valid return.
+Annotations and `PairPrediction` count beams (they are what files hold), tensors count points; `Scan.beam` leads from one to the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+BACKGROUND = 0
+OUTLIER = -1
+MAX_RANGE_MARGIN = 0.05  # spec 0.2: a return this close to range_max is a beam that hit nothing
+CLOSED_SPAN = np.radians(345.0)  # a scan that sees this much of the circle has neighbours across +-180 deg (A-06)
+
+
+def _vector(name: str, values: ArrayLike, length: int | None = None) -> Floats:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 1 or (length is not None and len(array) != length):
+        expected = "(N,)" if length is None else f"({length},)"
+        raise ValueError(f"{name}: expected shape {expected}, got {array.shape}")
+    return array
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """The valid returns of one planar laser scan, in beam order.
+
+    Attributes:
+        ranges: (N,) metres.
+        bearings: (N,) radians, counter-clockwise, non-decreasing.
+        beam: (N,) index of every return in the arrays that came in.
+        n_beams: length of those arrays.
+        range_min, range_max, range_noise: metres, None when unknown.
+    """
+
+    ranges: Floats
+    bearings: Floats
+    beam: Ints
+    n_beams: int
+    range_min: float | None = None
+    range_max: float | None = None
+    range_noise: float | None = None
+
+    @classmethod
+    def from_ranges(
+        cls,
+        ranges: ArrayLike,
+        bearings: ArrayLike | None = None,
+        *,
+        angle_min: float | None = None,
+        angle_increment: float | None = None,
+        range_min: float | None = None,
+        range_max: float | None = None,
+        range_noise: float | None = None,
+    ) -> Scan:
+        """Makes a scan from ranges and bearings, or from ranges, `angle_min` and `angle_increment`.
+
+        Invalid returns (not finite, not above max(range_min, 0), not below range_max - 0.05 m) are dropped.
+
+        Raises:
+            ValueError: wrong shapes, neither or both forms of bearings, bearings not finite or decreasing.
+        """
+        ranges = _vector("ranges", ranges)
+        if (bearings is None) == (angle_min is None or angle_increment is None):
+            raise ValueError("bearings: expected either bearings or both angle_min and angle_increment, got neither or both")
+        if bearings is None:
+            assert angle_min is not None and angle_increment is not None
+            bearings = angle_min + angle_increment * np.arange(len(ranges))
+        bearings = _vector("bearings", bearings, len(ranges))
+        if not np.isfinite(bearings).all():
+            raise ValueError(f"bearings: expected finite numbers, got {np.count_nonzero(~np.isfinite(bearings))} that are not")
+        if (np.diff(bearings) < 0).any():
+            raise ValueError(f"bearings: expected counter-clockwise (non-decreasing), got a step back at {np.argmax(np.diff(bearings) < 0)}")
+        with np.errstate(invalid="ignore"):
+            valid = np.isfinite(ranges) & (ranges > max(range_min or 0.0, 0.0))
+            if range_max is not None:
+                valid &= ranges < range_max - MAX_RANGE_MARGIN
+        beam = np.flatnonzero(valid)
+        return cls(ranges[beam], bearings[beam], beam, len(ranges), range_min, range_max, range_noise)
+
+    def __len__(self) -> int:
+        return len(self.ranges)
+
+    @property
+    def points(self) -> Floats:
+        """(N, 2) Cartesian points in the sensor's frame, metres."""
+        return self.ranges[:, None] * np.stack([np.cos(self.bearings), np.sin(self.bearings)], axis=1)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the first and the last return are neighbours: the returns span (nearly) the whole circle."""
+        return len(self) > 2 and float(self.bearings[-1] - self.bearings[0]) > CLOSED_SPAN
+
+    def to_beams(self, values: NDArray[Any], fill: Any) -> NDArray[Any]:
+        """Scatters (N, ...) values of the points to (n_beams, ...), `fill` where the beam returned nothing."""
+        out = np.full((self.n_beams, *values.shape[1:]), fill, dtype=values.dtype)
+        out[self.beam] = values
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Annotation:
+    """What became of every source beam (`n` = source.n_beams); the pair file's optional keys.
+
+    Attributes:
+        association: (n,) target beam, -1 outlier (no counterpart).
+        cluster: (n,) 0 background, k >= 1 moving object k, -1 exactly where association is -1.
+        motions: (K+1, 3) `T_target_source` of every cluster; a NaN row where the object is not in this pair.
+        body: (n,) what the beam belongs to even without a counterpart, -1 unknown.
+        ignore: (n,) bool, beams that nobody annotated.
+    """
+
+    association: Ints
+    cluster: Ints
+    motions: Floats
+    body: Ints
+    ignore: Bools
+
+
+@dataclass(frozen=True, slots=True)
+class ScanPair:
+    """Two consecutive scans `dt` seconds apart, with or without annotation.
+
+    `sequence` names the recording (pairs of one sequence overlap in time: never split one between training and test), `name`
+    the pair, `origin` where the data comes from.
+    """
+
+    source: Scan
+    target: Scan
+    dt: float = 0.1
+    annotation: Annotation | None = None
+    sequence: str = ""
+    name: str = ""
+    origin: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PairPrediction:
+    """The answer for one pair, by source beam: exactly the contents of a prediction file.
+
+    Attributes:
+        association: (n,) int64 target beam, -1 outlier.
+        cluster: (n,) int64 0 background, k >= 1 mover k, -1 outlier.
+        motions: (K+1, 3) `T_target_source` of background and movers; the sensor moved by the inverse of row 0.
+        association_confidence, cluster_confidence: (n,) in [0, 1].
+        converged: whether the labels had settled when the iterations ended.
+    """
+
+    association: Ints
+    cluster: Ints
+    motions: Floats
+    association_confidence: Floats
+    cluster_confidence: Floats
+    converged: bool
