@@ -1,0 +1,184 @@
+"""Pairs as padded tensors with masks, and the model's answer for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The annotation of a batch, by point.
+
+    Attributes:
+        association: (B, N) int64 target point, -1 outlier.
+        cluster: (B, N) int64 0 background, k >= 1 mover, -1 outlier.
+        motions: (B, G, 3) motion of every annotated cluster, NaN where there is none.
+        known: (B, N) bool, real points that somebody annotated.
+    """
+
+    association: Tensor
+    cluster: Tensor
+    motions: Tensor
+    known: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class ScanPairBatch:
+    """B scan pairs, padded at the end of every scan.
+
+    Attributes:
+        source: (B, N, 2), target: (B, M, 2). Cartesian points, each scan in its own sensor frame, in beam order; 0 in the padding.
+        source_mask: (B, N), target_mask: (B, M). True = real; a scan's real points come first.
+        source_closed, target_closed: (B,) bool. The scan covers the whole circle.
+        dt: (B,) seconds between the scans.
+        range_noise: (B,) standard deviation of a return, metres; estimated from the scans where the sensor does not say.
+        initial_motion: (B, 3) `T_target_source` guess (odometry); the identity where there is none.
+        truth: the annotation, when every pair has one.
+    """
+
+    source: Tensor
+    target: Tensor
+    source_mask: Tensor
+    target_mask: Tensor
+    source_closed: Tensor
+    target_closed: Tensor
+    dt: Tensor
+    range_noise: Tensor
+    initial_motion: Tensor
+    truth: Truth | None = None
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def to(self, target: torch.device | torch.dtype | str) -> ScanPairBatch:
+        """The batch on another device, or with its floating-point tensors in another dtype."""
+
+        def move(value: Tensor) -> Tensor:
+            return value if isinstance(target, torch.dtype) and not value.is_floating_point() else value.to(target)
+
+        moved = {f.name: move(getattr(self, f.name)) for f in fields(self) if f.name != "truth"}
+        truth = self.truth and Truth(*(move(getattr(self.truth, f.name)) for f in fields(self.truth)))
+        return ScanPairBatch(**moved, truth=truth)
+
+    def __getitem__(self, index: slice) -> ScanPairBatch:
+        """A part of the batch, with the same padding."""
+        if not isinstance(index, slice):
+            raise TypeError(f"index: expected a slice, got {type(index).__name__}")
+        part = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "truth"}
+        truth = self.truth and Truth(*(getattr(self.truth, f.name)[index] for f in fields(self.truth)))
+        return ScanPairBatch(**part, truth=truth)
+
+    def without_truth(self) -> ScanPairBatch:
+        """The batch as a user brings it, without annotation."""
+        return replace(self, truth=None)
+
+    @classmethod
+    def collate(cls, pairs: Sequence[ScanPair], dtype: torch.dtype = torch.float32) -> ScanPairBatch:
+        """Pads pairs into one batch (at least one, masked, point a scan). The truth is there when every pair is annotated."""
+        if not pairs:
+            raise ValueError("pairs: expected at least one pair, got none")
+        source, source_mask = _pad_points([pair.source for pair in pairs])
+        target, target_mask = _pad_points([pair.target for pair in pairs])
+        return cls(
+            source=source.to(dtype),
+            target=target.to(dtype),
+            source_mask=source_mask,
+            target_mask=target_mask,
+            source_closed=torch.tensor([pair.source.is_closed for pair in pairs]),
+            target_closed=torch.tensor([pair.target.is_closed for pair in pairs]),
+            dt=torch.tensor([pair.dt for pair in pairs], dtype=dtype),
+            range_noise=torch.tensor([_range_noise(pair) for pair in pairs], dtype=dtype),
+            initial_motion=torch.zeros(len(pairs), 3, dtype=dtype),
+            truth=_collate_truth(pairs, source_mask, dtype) if all(pair.annotation for pair in pairs) else None,
+        )
+
+
+def _pad_points(scans: Sequence[Scan]) -> tuple[Tensor, Tensor]:
+    """(B, N, 2) points and (B, N) mask."""
+    lengths = torch.tensor([len(scan) for scan in scans])
+    longest = max(1, int(lengths.max()))
+    points = torch.zeros(len(scans), longest, 2, dtype=torch.float64)
+    for row, scan in zip(points, scans, strict=True):
+        row[: len(scan)] = torch.from_numpy(scan.points)
+    return points, torch.arange(longest) < lengths[:, None]
+
+
+def _range_noise(pair: ScanPair) -> float:
+    """What the sensor says, else an estimate: on smooth surfaces the ranges' second difference is noise alone."""
+    if pair.source.range_noise is not None:
+        return pair.source.range_noise
+    second = np.concatenate([np.diff(scan.ranges, n=2) for scan in (pair.source, pair.target)])
+    if len(second) == 0:
+        return 0.01
+    return float(np.clip(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0), 1e-3, 0.1))
+
+
+def _collate_truth(pairs: Sequence[ScanPair], source_mask: Tensor, dtype: torch.dtype) -> Truth:
+    shape = tuple(source_mask.shape)
+    association, cluster = np.full(shape, -1), np.full(shape, -1)
+    known = np.zeros(shape, dtype=bool)
+    motions = np.full((len(pairs), max(len(pair.annotation.motions) for pair in pairs if pair.annotation), 3), np.nan)
+    for b, pair in enumerate(pairs):
+        truth, beam, n = pair.annotation, pair.source.beam, len(pair.source)
+        assert truth is not None
+        point_of_beam = np.full(pair.target.n_beams + 1, -1)  # the last entry keeps -1 at -1
+        point_of_beam[pair.target.beam] = np.arange(len(pair.target))
+        association[b, :n] = point_of_beam[truth.association[beam]]
+        cluster[b, :n] = truth.cluster[beam]
+        known[b, :n] = ~truth.ignore[beam]
+        motions[b, : len(truth.motions)] = truth.motions
+    return Truth(*map(torch.from_numpy, (association, cluster)), torch.from_numpy(motions).to(dtype), torch.from_numpy(known))
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What the model says of a batch; tensors of points, batch first.
+
+    Attributes:
+        association: (B, N) int64 target point, -1 outlier. Piecewise constant: no gradient.
+        cluster: (B, N) int64 0 background, 1..D-2 movers, -1 outlier. No gradient.
+        motions: (B, D-1, 3) `T_target_source` of background and movers.
+        active: (B, D-1) bool, the clusters that exist.
+        candidates: (B, N, K) int64 target point that every inlier association state stands for.
+        log_association: (B, N, K+1) normalised log-beliefs of the association chain, last = outlier.
+        log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier.
+        converged: (B,) bool, whether labels and motions had settled.
+        iterations: (B,) int64 rounds done.
+    """
+
+    association: Tensor
+    cluster: Tensor
+    motions: Tensor
+    active: Tensor
+    candidates: Tensor
+    log_association: Tensor
+    log_cluster: Tensor
+    converged: Tensor
+    iterations: Tensor
+
+    def pair(self, b: int, pair: ScanPair) -> PairPrediction:
+        """Pair b by beam, its movers numbered 1.. by falling size, the vacuous ones left out."""
+        n = len(pair.source)
+        association, cluster = self.association[b, :n].cpu().numpy(), self.cluster[b, :n].cpu().numpy()
+        motions = self.motions[b].detach().cpu().double().numpy()
+        sizes = np.bincount(cluster[cluster > 0], minlength=len(motions))
+        movers = [k for k in np.argsort(-sizes, kind="stable") if k > 0 and sizes[k] > 0]
+        number = np.full(len(motions) + 1, -1)  # the last entry keeps -1 at -1
+        number[[0, *movers]] = np.arange(len(movers) + 1)
+        beam_of_point = np.append(pair.target.beam, -1)
+        confidences = [log.detach()[b, :n].exp().amax(-1).cpu().double().numpy() for log in (self.log_association, self.log_cluster)]
+        return PairPrediction(
+            association=pair.source.to_beams(beam_of_point[association], -1),
+            cluster=pair.source.to_beams(number[cluster], -1),
+            motions=motions[[0, *movers]],
+            association_confidence=pair.source.to_beams(confidences[0], 0.0),
+            cluster_confidence=pair.source.to_beams(confidences[1], 0.0),
+            converged=bool(self.converged[b]),
+        )
