@@ -1,0 +1,69 @@
+"""The target points that a source point may have become: K of them, or all (spec 7.7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcrf_scan.geometry import se2
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """The inlier states of the association chain, ascending in target index.
+
+    Attributes:
+        index: (B, N, K) target points.
+        mask: (B, N, K) bool, real candidates (fewer than K where the target scan is short).
+        nearest: (B, N, C) nearest target point under every motion.
+    """
+
+    index: Tensor
+    mask: Tensor
+    nearest: Tensor
+
+
+def squared_distances(moved: Tensor, target_points: Tensor, target_mask: Tensor) -> Tensor:
+    """(..., N, M) squared distances, inf to padding. moved: (..., N, 2); target_points: (..., M, 2); target_mask: (..., M)."""
+    dx = moved[..., :, None, 0] - target_points[..., None, :, 0]
+    dy = moved[..., :, None, 1] - target_points[..., None, :, 1]
+    return (dx * dx + dy * dy).masked_fill(~target_mask[..., None, :], torch.inf)
+
+
+def by_motion(
+    source_points: Tensor, target_points: Tensor, target_mask: Tensor, motions: Tensor, active: Tensor, count: int
+) -> Candidates:
+    """The `count` target points that come nearest under any active motion; all of them when count is 0 (dense).
+
+    Args:
+        source_points: (B, N, 2); target_points: (B, M, 2); target_mask: (B, M); motions: (B, C, 3); active: (B, C).
+        count: K; memory and time grow with B C N M.
+    """
+    with torch.no_grad():  # a choice of states, not a function to follow
+        moved = se2.apply(motions, source_points[:, None])  # (B, C, N, 2)
+        distance = squared_distances(moved, target_points[:, None], target_mask[:, None])
+        nearest = distance.argmin(-1).transpose(1, 2)  # (B, N, C)
+        if count == 0 or count >= target_points.shape[1]:
+            return Candidates(*every_target(source_points, target_mask), nearest)
+        over_motions = distance.masked_fill(~active[:, :, None, None], torch.inf).amin(1)  # (B, N, M)
+        closest, index = over_motions.topk(count, dim=-1, largest=False)
+        mask = closest < torch.inf
+        order = torch.where(mask, index, target_points.shape[1]).argsort(-1)  # real ones first, ascending
+        return Candidates(index.gather(-1, order), mask.gather(-1, order), nearest)
+
+
+def every_target(source_points: Tensor, target_mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Index and mask (B, N, M) of the dense model."""
+    shape = (*source_points.shape[:2], target_mask.shape[1])
+    return torch.arange(shape[2], device=target_mask.device).expand(shape), target_mask[:, None].expand(shape)
+
+
+def by_score(score: Tensor, target_mask: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Index and mask (B, N, K) of the best `count` targets by a (B, N, M) score: the cold search, when no motion is known."""
+    masked = score.masked_fill(~target_mask[:, None], -torch.inf)
+    best, index = masked.topk(min(count, score.shape[-1]), dim=-1)
+    mask = best > -torch.inf
+    order = torch.where(mask, index, score.shape[-1]).argsort(-1)
+    return index.gather(-1, order), mask.gather(-1, order)

@@ -1,0 +1,70 @@
+"""The constants that features are measured in; fitted on the training pairs (spec 1.3, 3, 4), kept with the weights."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+KAPPA = 9.0  # an error of three standard deviations is as bad as any (spec 0.1)
+
+LOCAL_CHANNELS = (
+    *("dist1", "dist3", "dist5", "angle1", "angle3", "angle5", "geo1", "geo3", "geo5"),
+    *("radius", "translation", "registered_translation"),
+)  # L1..L12
+SHAPE_CHANNELS = 9  # the first nine do not change when either scan moves
+STATIC_CHANNELS = 11  # the last one depends on the motions
+ASSOCIATION_WEIGHTS = (
+    *LOCAL_CHANNELS,
+    *("data_boosting", "outlier_boosting"),
+    *("sequence", "pairwise_outlier", "pairwise_distance", "pairwise_translation"),
+)  # a01..a18
+CLUSTERING_WEIGHTS = (
+    *("cluster_distance", "outlier", "cluster_inlier_in", "cluster_inlier_out"),
+    *("sequence", "neighbour_weight_same", "neighbour_weight_different", "neighbour_stiffness_same", "neighbour_stiffness_different"),
+    *("neighbour_distance_same", "neighbour_distance_different", "pairwise_outlier"),
+)  # c01..c12
+
+
+def robust_square(error: Tensor, scale: Tensor) -> Tensor:
+    """Minus min((error / scale)^2, kappa): 0 is perfect, -9 as bad as it gets (spec 0.1, A-03)."""
+    return -((error / scale) ** 2).clamp(max=KAPPA)
+
+
+class Scales(nn.Module):
+    """Buffers, all in metres or radians unless said; the defaults are those of a street scanner before any fitting.
+
+    Attributes:
+        local: (12,) scale of every local association channel.
+        local_outlier: (12,) what every channel gives the outlier state: the worst tenth of the true pairs (spec 5.1).
+        pairwise: (2,) scales of pairwise distance and pairwise translation.
+        pairwise_outlier: (2,) their value on every transition that touches the outlier (A-14).
+        cluster_distance: () scale of a point's residual under its own motion.
+        outlier_threshold: () residual above which no motion explains a point.
+        neighbour_weight: () reach of the neighbour weight.
+        neighbour_distance: () scale of the elongation of an edge (stiffness, neighbour distance).
+    """
+
+    local: Tensor
+    local_outlier: Tensor
+    pairwise: Tensor
+    pairwise_outlier: Tensor
+    cluster_distance: Tensor
+    outlier_threshold: Tensor
+    neighbour_weight: Tensor
+    neighbour_distance: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        local = [0.1, 0.2, 0.3, 0.3, 0.3, 0.3, 0.1, 0.3, 0.5, 0.5, 0.5, 0.1]
+        values = {
+            "local": local,
+            "local_outlier": [-4.0] * 12,
+            "pairwise": [0.1, 0.15],
+            "pairwise_outlier": [-4.0, -4.0],
+            "cluster_distance": 0.1,
+            "outlier_threshold": 0.3,
+            "neighbour_weight": 0.5,
+            "neighbour_distance": 0.1,
+        }
+        for name, value in values.items():
+            self.register_buffer(name, torch.tensor(value))

@@ -1,0 +1,74 @@
+"""Exact messages on a chain, in the log domain: max-product, sum-product and what lies between (the paper's Eqs. 2 and 3)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def reduce_states(log_values: Tensor, dim: int, temperature: float) -> Tensor:
+    """max at temperature 0, temperature * logsumexp(x / temperature) above; -inf where nothing is possible."""
+    if temperature == 0:
+        return log_values.amax(dim)
+    peak = log_values.detach().amax(dim, keepdim=True)
+    peak = torch.where(peak > -torch.inf, peak, torch.zeros_like(peak))
+    total = torch.exp((log_values - peak) / temperature).sum(dim)
+    positive = total > 0
+    log_total = torch.log(torch.where(positive, total, torch.ones_like(total)))
+    return torch.where(positive, temperature * log_total + peak.squeeze(dim), torch.full_like(total, -torch.inf))
+
+
+def normalise(log_message: Tensor) -> Tensor:
+    """Subtracts the largest entry of the last axis; a message that is impossible everywhere stays so."""
+    peak = log_message.amax(-1, keepdim=True)
+    return log_message - torch.where(peak > -torch.inf, peak, torch.zeros_like(peak)).detach()
+
+
+def silence_padding(log_unary: Tensor, log_pairwise: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Potentials in which padded nodes, all at the end of a chain, say nothing to the real ones. mask: (B, N)."""
+    edge = mask[:, 1:, None, None]
+    return (
+        torch.where(mask[..., None], log_unary, torch.zeros_like(log_unary)),
+        torch.where(edge, log_pairwise, torch.zeros_like(log_pairwise)),
+    )
+
+
+def chain_messages(log_unary: Tensor, log_pairwise: Tensor, temperature: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Forward and backward messages of B chains (spec 7.1), both directions at once, N - 1 steps.
+
+    Args:
+        log_unary: (B, N, S). log_pairwise: (B, N-1, S, S), row = state of node i, column = state of node i + 1.
+        temperature: 0 = max-product, 1 = sum-product.
+
+    Returns:
+        (B, N, S) message into every node from the node before it and (B, N, S) from the node after it; 0 at the ends.
+    """
+    both_unary = torch.cat([log_unary, log_unary.flip(1)])  # (2B, N, S)
+    both_pairwise = torch.cat([log_pairwise, log_pairwise.flip(1).transpose(-1, -2)])
+    outgoing = both_unary[:, :-1, :, None] + both_pairwise  # (2B, N-1, S, S)
+    message = torch.zeros_like(both_unary[:, 0])
+    messages = [message]
+    for step in outgoing.unbind(1):
+        message = normalise(reduce_states(step + message[:, :, None], 1, temperature))
+        messages.append(message)
+    forward, backward = torch.stack(messages, dim=1).chunk(2)
+    return forward, backward.flip(1)
+
+
+def log_partition(log_unary: Tensor, log_pairwise: Tensor, temperature: float = 1.0) -> Tensor:
+    """(B,) log of the summed (temperature 0: of the largest) score of all labellings. Arguments as in `chain_messages`."""
+    message = log_unary[:, 0]
+    for i in range(1, log_unary.shape[1]):
+        message = reduce_states(message[:, :, None] + log_pairwise[:, i - 1], 1, temperature) + log_unary[:, i]
+    return reduce_states(message, -1, temperature)
+
+
+def chain_beliefs(log_unary: Tensor, log_pairwise: Tensor, mask: Tensor, temperature: float = 0.0) -> Tensor:
+    """Normalised log-beliefs (B, N, S): max-marginals at temperature 0, marginals at 1; padding is silent (Eq. 3).
+
+    `log_softmax` of unary plus messages; at temperature 1 these are log marginal probabilities.
+    """
+    log_unary, log_pairwise = silence_padding(log_unary, log_pairwise, mask)
+    forward, backward = chain_messages(log_unary, log_pairwise, temperature)
+    beliefs = log_unary + forward + backward
+    return torch.log_softmax(beliefs if temperature == 0 else beliefs / temperature, dim=-1)
