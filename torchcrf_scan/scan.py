@@ -22,7 +22,7 @@ Bools = NDArray[np.bool_]
 BACKGROUND = 0
 OUTLIER = -1
 MAX_RANGE_MARGIN = 0.05  # spec 0.2: a return this close to range_max is a beam that hit nothing
-CLOSED_SPAN = np.radians(345.0)  # a scan that sees this much of the circle has neighbours across +-180 deg
+CLOSED_SPAN = float(np.radians(315.0))  # a scan that sees this much of the circle has neighbours across +-180 deg
 
 
 def _vector(name: str, values: ArrayLike, length: int | None = None) -> Floats:

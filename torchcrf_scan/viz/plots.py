@@ -21,18 +21,19 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, Scan, ScanPair
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 SOURCE, TARGET = "#4F7396", "#F28E2B"
-STATIC, INK, WRONG = "#A3A9B0", "#1F2328", "#C1121F"
+STATIC, INK, NOTE, WRONG = "#A3A9B0", "#1F2328", "#57606A", "#C1121F"
 MOVERS = ("#009E73", "#CC5FA6", "#0072B2", "#D55E00", "#6F4E9C", "#35A7DB")  # after Okabe and Ito, told apart by the colour-blind
 MARKERS = "osD^v"  # the second six movers wear the second marker, and so on
 FAINT = 0.22  # opacity of what nobody annotated
 ASSOCIATION_TOLERANCE = 2  # beams: an association this near is drawn as right
 HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # seconds of travel that an arrow may stand for
 MAX_SPEED_LABELS = 10  # the largest movers, more would cover the picture
-PANEL_HEIGHT = 3.7  # inches
+PANEL_HEIGHT = 3.3  # inches
 MAX_COLUMNS = 4
 
 Window = tuple[Floats, Floats]  # lower and upper corner, (2,) each
@@ -48,6 +49,7 @@ class _Scene:
     faint: Bools
     window: Window
     zoom: Window | None
+    arrow_seconds: float  # of travel, the same for all panels
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +82,7 @@ def plot_pair(pair: ScanPair, prediction: PairPrediction | None = None) -> Figur
     """Draws a pair, its prediction (first row) and its annotation (next row, with the prediction's mistakes ringed).
 
     Columns: both scans in their sensors' frames (next row: with the sensor's motion undone); associations; clusters with the
-    movers' velocities and the sensor's motion; a magnified view of the largest mover. Rows and columns without content are left out.
+    movers' velocities and the sensor's motion; the largest mover magnified. Rows and columns without content are left out.
 
     Raises:
         ValueError: the prediction does not fit the pair.
@@ -234,10 +236,34 @@ def _scene(pair: ScanPair, answers: list[_Labels]) -> _Scene:
     """The common ground of all panels; `answers` in order of trust: the first that has a mover chooses the magnified view."""
     source, target = _beam_points(pair.source), _beam_points(pair.target)
     faint = np.zeros(len(source), dtype=bool) if pair.annotation is None else np.asarray(pair.annotation.ignore)
-    centroids = [c for c in (_centroid(source, answers[0].cluster == k) for k in answers[0].movers) if np.isfinite(c).all()] if answers else []
+    centroids = [_centroid(source, labels.cluster == k) for labels in answers[:1] for k in labels.movers]
     window = _robust_window(np.concatenate([source, target]), np.reshape(centroids, (-1, 2)))
     zooms = (_zoom_window(source, target, labels, window) for labels in answers)
-    return _Scene(source, target, pair.dt, faint, window, next((zoom for zoom in zooms if zoom is not None), None))
+    zoom = next((zoom for zoom in zooms if zoom is not None), None)
+    speeds = [[float(np.hypot(*v)) for _, v in _velocities(source, pair.dt, labels).values()] for labels in answers]
+    seconds = _horizon([max(fastest) for fastest in speeds if fastest], window)
+    return _Scene(source, target, pair.dt, faint, window, zoom, seconds)
+
+
+def _velocities(source: Floats, dt: float, labels: _Labels) -> dict[int, tuple[Floats, Floats]]:
+    """Mover -> its centroid and its velocity relative to the world in the source frame, (2,) each, where both are known."""
+    if not (np.isfinite(dt) and dt > 0.0):
+        return {}
+    from_target = se2.inverse(labels.motion(BACKGROUND))
+    known = {}
+    for k in labels.movers.tolist():
+        centroid = _centroid(source, labels.cluster == k)
+        end = se2.apply(se2.compose(from_target, labels.motion(k)), centroid[None])[0]
+        if np.isfinite(end).all():
+            known[k] = (centroid, (end - centroid) / dt)
+    return known
+
+
+def _horizon(fastest: list[float], window: Window) -> float:
+    """The longest of `HORIZONS` in which the fastest mover of a typical answer stays within a fifth of the picture."""
+    reach = 0.2 * float((window[1] - window[0]).max())
+    speed = float(np.median(fastest)) if fastest else 0.0
+    return max((seconds for seconds in HORIZONS if seconds * speed <= reach), default=HORIZONS[0])
 
 
 def _beam_points(scan: Scan) -> Floats:
@@ -250,13 +276,13 @@ def _centroid(points: Floats, mask: Bools) -> Floats:
 
 
 def _robust_window(points: Floats, always: Floats) -> Window:
-    """Holds the sensor, 96 % of the points per axis and the `always` ones, with a margin; aspect between 0.8 and 1.6."""
-    points = points[np.isfinite(points).all(axis=-1)]
+    """Holds the sensor, 96 % of the points per axis and the `always` ones, with a margin; aspect between 0.85 and 1.4."""
+    points, always = points[np.isfinite(points).all(axis=-1)], always[np.isfinite(always).all(axis=-1)]
     bulk = np.percentile(points, (2, 98), axis=0) if len(points) else np.zeros((1, 2))
     corners = np.concatenate([bulk, always, np.zeros((1, 2))])
     low, high = corners.min(axis=0), corners.max(axis=0)
     size = np.maximum(1.16 * (high - low), max(0.1 * float((high - low).max()), 0.5))
-    size = np.maximum(size, [0.8 * size[1], size[0] / 1.6])
+    size = np.maximum(size, [0.85 * size[1], size[0] / 1.4])
     return _box((low + high) / 2, size)
 
 
@@ -269,7 +295,7 @@ def _zoom_window(source: Floats, target: Floats, labels: _Labels, window: Window
     points = np.concatenate([source[mask], target[labels.association[mask & (labels.association >= 0)]]])
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     full = window[1] - window[0]
-    scale = float(np.clip((1.5 * (high - low) / full).max(), 0.06, 1.0))
+    scale = float(np.clip((1.35 * (high - low) / full).max(), 0.03, 1.0))
     return _box((low + high) / 2, scale * full)
 
 
@@ -282,8 +308,8 @@ def _box(centre: Floats, size: Floats) -> Window:
 
 def _draw_scans(ax: Axes, scene: _Scene) -> None:
     _frame(ax, scene.window, "both scans", "each in its own sensor's frame")
-    _dots(ax, scene.target, TARGET, "target scan", size=2.6)
-    _dots(ax, scene.source, SOURCE, "source scan", size=2.6)
+    _dots(ax, scene.target, TARGET, "target scan", size=3.0)
+    _dots(ax, scene.source, SOURCE, "source scan", size=3.0)
     _sensor(ax, np.zeros(2), INK)
 
 
@@ -291,18 +317,17 @@ def _draw_registered(ax: Axes, scene: _Scene, answer: _Answer) -> None:
     """Both scans in the target's frame: what is static coincides, what moves stands apart."""
     background = answer.labels.motion(BACKGROUND)
     _frame(ax, scene.window, "sensor's motion undone", f"source moved by the {answer.name} background motion")
-    _dots(ax, scene.target, TARGET, "target scan", size=2.6)
+    _dots(ax, scene.target, TARGET, "target scan", size=3.0)
     if np.isfinite(background).all():
-        _dots(ax, se2.apply(background, scene.source), SOURCE, "source scan", size=2.6)
+        _dots(ax, se2.apply(background, scene.source), SOURCE, "source scan", size=3.0)
         _sensor(ax, background[1:], SOURCE)
     _sensor(ax, np.zeros(2), TARGET)
 
 
 def _draw_associations(ax: Axes, scene: _Scene, answer: _Answer, title: str) -> None:
     outliers = int((np.isfinite(scene.source[:, 0]) & (answer.labels.association < 0)).sum())
-    note = f"{outliers} outliers" + _mistakes(answer.wrong_association, scene)
-    _frame(ax, scene.window, title, note)
-    _associations(ax, scene, answer, size=2.0)
+    _frame(ax, scene.window, title, f"{outliers} outliers", _mistakes(answer.wrong_association, scene))
+    _associations(ax, scene, answer, size=2.4)
     if scene.zoom is not None:
         (x, y), (x_end, y_end) = scene.zoom
         ax.plot([x, x_end, x_end, x, x], [y, y, y_end, y_end, y], color=INK, lw=0.8, ls=(0, (4, 3)), zorder=5)
@@ -317,15 +342,16 @@ def _draw_zoom(ax: Axes, scene: _Scene, answer: _Answer, title: str) -> None:
 
 def _draw_clusters(ax: Axes, scene: _Scene, answer: _Answer, title: str) -> None:
     labels = answer.labels
-    _frame(ax, scene.window, title, _ego_motion(labels.motion(BACKGROUND)) + _mistakes(answer.wrong_cluster, scene))
+    _frame(ax, scene.window, title, _ego_motion(labels.motion(BACKGROUND)), _mistakes(answer.wrong_cluster, scene))
     static = labels.cluster == BACKGROUND
-    _dots(ax, scene.source, STATIC, "background", static, scene.faint, size=2.6)
-    for k in labels.movers.tolist():
+    _dots(ax, scene.source, STATIC, "background", static, scene.faint, size=3.0)
+    for index, k in enumerate(labels.movers.tolist()):
         color, marker = _look(k)
-        _dots(ax, scene.source, color, "", labels.cluster == k, scene.faint, size=4.2, marker=marker)
-    _outliers(ax, scene, labels.cluster == OUTLIER, size=3.2)
-    _rings(ax, scene, answer.wrong_cluster, size=7.5)
-    _velocities(ax, scene, labels)
+        name = "" if index else "mover, with its speed"
+        _dots(ax, scene.source, color, name, labels.cluster == k, scene.faint, size=4.6, marker=marker)
+    _outliers(ax, scene, labels.cluster == OUTLIER, size=3.6)
+    _rings(ax, scene, answer.wrong_cluster, size=6.5)
+    _arrows(ax, scene, labels)
     _sensor(ax, np.zeros(2), INK)
 
 
@@ -337,7 +363,7 @@ def _associations(ax: Axes, scene: _Scene, answer: _Answer, size: float) -> None
         _lines(ax, scene, labels, associated & (labels.cluster == k), k, width=0.5 + 0.12 * size)
     _dots(ax, scene.source, SOURCE, "source scan", associated, scene.faint, size=size)
     _outliers(ax, scene, ~associated, size=1.6 + 0.8 * size)
-    _rings(ax, scene, answer.wrong_association, size=5.0 + size)
+    _rings(ax, scene, answer.wrong_association, size=4.5 + size)
 
 
 # Marks
@@ -368,12 +394,13 @@ def _outliers(ax: Axes, scene: _Scene, mask: Bools, size: float) -> None:
 
 def _rings(ax: Axes, scene: _Scene, mask: Bools | None, size: float) -> None:
     if mask is not None and mask.any():
-        ax.plot(*scene.source[mask].T, ls="", marker="o", ms=size, mfc="none", mec=WRONG, mew=0.9, label="predicted wrong", zorder=4)
+        points = scene.source[mask].T
+        ax.plot(*points, ls="", marker="o", ms=size, mfc="none", mec=WRONG, mew=0.9, label="predicted wrong", zorder=4)
 
 
 def _lines(ax: Axes, scene: _Scene, labels: _Labels, mask: Bools, cluster: int, width: float) -> None:
     """Lines from source points to their target points, in the cluster's colour; one artist, broken by NaN."""
-    color = INK if cluster <= BACKGROUND else _look(cluster)[0]
+    color = NOTE if cluster <= BACKGROUND else _look(cluster)[0]
     for part, alpha in _by_opacity(mask, scene.faint):
         ends = np.stack([scene.source[part], scene.target[labels.association[part]]], axis=1)  # (n, 2 ends, 2)
         path = np.concatenate([ends, np.full((len(ends), 1, 2), np.nan)], axis=1).reshape(-1, 2)
@@ -381,49 +408,35 @@ def _lines(ax: Axes, scene: _Scene, labels: _Labels, mask: Bools, cluster: int, 
         ax.plot(*path.T, color=color, lw=width, alpha=0.75 * alpha, label=name, zorder=2)
 
 
-def _velocities(ax: Axes, scene: _Scene, labels: _Labels) -> None:
-    """Arrows and speeds of the movers whose motion is known; all arrows of a panel stand for the same time of travel."""
-    if not (np.isfinite(scene.dt) and scene.dt > 0):
+def _arrows(ax: Axes, scene: _Scene, labels: _Labels) -> None:
+    """Arrows and speeds of the movers whose motion is known."""
+    known = _velocities(scene.source, scene.dt, labels)
+    if not known:
         return
-    moving = [(k, *_velocity(scene, labels, k)) for k in labels.movers.tolist()]
-    moving = [(k, centroid, velocity) for k, centroid, velocity in moving if np.isfinite(velocity).all()]
-    if not moving:
-        return
-    centroids, velocities = np.stack([m[1] for m in moving]), np.stack([m[2] for m in moving])
-    seconds = _horizon(velocities, scene.window)
-    colors = [_look(k)[0] for k, *_ in moving]
+    centroids, velocities = np.stack([c for c, _ in known.values()]), np.stack([v for _, v in known.values()])
     ax.quiver(
-        *centroids.T, *(seconds * velocities).T, color=colors, angles="xy", scale_units="xy", scale=1, units="inches", width=0.03,
-        edgecolor="white", linewidth=0.4, minshaft=1.5, zorder=6,
+        *centroids.T, *(scene.arrow_seconds * velocities).T, color=[_look(k)[0] for k in known], angles="xy", scale_units="xy",
+        scale=1, units="inches", width=0.03, edgecolor="white", linewidth=0.4, minshaft=1.5, zorder=6,
     )  # fmt: skip
-    largest = sorted(moving, key=lambda m: -int((labels.cluster == m[0]).sum()))[:MAX_SPEED_LABELS]
-    for k, centroid, velocity in largest:
-        _speed_label(ax, centroid + seconds * velocity, velocity, _look(k)[0])
-    ax.text(0.985, 0.015, f"arrow: {seconds:g} s of travel", transform=ax.transAxes, ha="right", va="bottom", fontsize=7, color="#57606A")
+    largest = sorted(known, key=lambda k: -int((labels.cluster == k).sum()))[:MAX_SPEED_LABELS]
+    for k in largest:
+        centroid, velocity = known[k]
+        _speed_label(ax, scene, centroid + scene.arrow_seconds * velocity, velocity, _look(k)[0])
+    note = f"arrow: {scene.arrow_seconds:g} s of travel"
+    ax.text(0.985, 0.015, note, transform=ax.transAxes, ha="right", va="bottom", fontsize=8, color=NOTE, zorder=7)
 
 
-def _velocity(scene: _Scene, labels: _Labels, mover: int) -> tuple[Floats, Floats]:
-    """Centroid of a mover and its velocity relative to the world, (2,) each, in the source frame."""
-    centroid = _centroid(scene.source, labels.cluster == mover)
-    end = se2.apply(se2.compose(se2.inverse(labels.motion(BACKGROUND)), labels.motion(mover)), centroid[None])[0]
-    return centroid, (end - centroid) / scene.dt
-
-
-def _horizon(velocities: Floats, window: Window) -> float:
-    """The longest of `HORIZONS` in which the fastest mover stays within a fifth of the picture."""
-    reach = 0.2 * float((window[1] - window[0]).max())
-    fastest = float(np.hypot(*velocities.T).max())
-    return max((s for s in HORIZONS if s * fastest <= reach), default=HORIZONS[0])
-
-
-def _speed_label(ax: Axes, tip: Floats, velocity: Floats, color: str) -> None:
-    speed = float(np.hypot(*velocity))
-    direction = velocity / speed if speed > 0.0 else np.array([0.0, 1.0])
+def _speed_label(ax: Axes, scene: _Scene, tip: Floats, velocity: Floats, color: str) -> None:
+    """Writes the speed at the arrow's tip, inside the picture even where the tip is not."""
+    low, high = scene.window
+    place = np.clip((tip - low) / (high - low), 0.02, 0.95)
+    side = "left" if place[0] < 0.15 else "right" if place[0] > 0.85 else "center"
+    speed, up = float(np.hypot(*velocity)), velocity[1] >= 0.0 and place[1] < 0.9
+    x, y = (low + place * (high - low)).tolist()
     ax.annotate(
-        f"{speed:.2f} m/s" if speed < 10.0 else f"{speed:.1f} m/s", tuple(tip), (14 * direction[0], 9 * direction[1]),
-        textcoords="offset points", ha="left" if direction[0] > 0.3 else "right" if direction[0] < -0.3 else "center", va="center",
-        fontsize=8, fontweight="bold", color=color, bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.8},
-        annotation_clip=True, in_layout=False, zorder=7,
+        f"{speed:.2f} m/s" if speed < 10.0 else f"{speed:.1f} m/s", (x, y), (0, 5 if up else -5), textcoords="offset points",
+        ha=side, va="bottom" if up else "top", fontsize=9, fontweight="bold", color=color,
+        bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.6}, in_layout=False, zorder=7,
     )  # fmt: skip
 
 
@@ -460,7 +473,7 @@ def _canvas(scene: _Scene, rows: int, columns: int) -> tuple[Figure, list[list[A
     return figure, [list(row) for row in axes]
 
 
-def _frame(ax: Axes, window: Window, title: str, note: str) -> None:
+def _frame(ax: Axes, window: Window, title: str, note: str, mistakes: str = "") -> None:
     ax.set_axis_on()
     ax.set_aspect("equal")
     (x, y), (x_end, y_end) = window
@@ -469,11 +482,12 @@ def _frame(ax: Axes, window: Window, title: str, note: str) -> None:
     ax.set_autoscale_on(False)
     ax.grid(color="#E6E8EB", lw=0.6)
     ax.set_axisbelow(True)
-    ax.tick_params(labelsize=7, color="#B8BEC5", labelcolor="#57606A", length=2.5)
+    ax.tick_params(labelsize=7, color="#B8BEC5", labelcolor=NOTE, length=2.5)
     for spine in ax.spines.values():
         spine.set_color("#B8BEC5")
-    ax.set_title(title, loc="left", fontsize=10.5, fontweight="bold", color=INK, pad=17, parse_math=False)
-    ax.annotate(note, (0, 1), (0, 4), xycoords="axes fraction", textcoords="offset points", fontsize=8, color="#57606A", va="bottom")
+    ax.set_title(title, loc="left", fontsize=11, fontweight="bold", color=INK, pad=19, parse_math=False)
+    ax.set_title(mistakes, loc="right", fontsize=9, color=WRONG, pad=19)
+    ax.text(0.0, 1.015, note, transform=ax.transAxes, fontsize=8.5, color=NOTE, va="bottom", in_layout=False)
 
 
 def _finish(figure: Figure, pair: ScanPair) -> Figure:
@@ -481,14 +495,14 @@ def _finish(figure: Figure, pair: ScanPair) -> Figure:
     name = pair.name or pair.sequence or "scan pair"
     counts = f"{len(pair.source)} and {len(pair.target)} returns, {pair.dt:.3g} s apart; x ahead, y left, metres"
     figure.suptitle(f"{name}: {counts}", x=0.008, ha="left", fontsize=11.5, color=INK, parse_math=False)
-    entries = {}
+    entries: dict[str, Artist] = {}
     for ax in figure.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
-        figure.legend(
-            list(entries.values()), list(entries), loc="outside lower center", ncols=len(entries), frameon=False, fontsize=8.5, markerscale=1.4
-        )
+        columns = len(entries) if figure.get_figwidth() > 8.0 else 3
+        handles, labels = list(entries.values()), list(entries)
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9, markerscale=1.4)
     return figure
 
 
@@ -496,11 +510,12 @@ def _ego_motion(background: Floats) -> str:
     if not np.isfinite(background).all():
         return "sensor's motion unknown"
     theta, x, y = se2.inverse(background)
-    return f"sensor: dx {x:+.2f} m, dy {y:+.2f} m, d\N{GREEK SMALL LETTER THETA} {np.degrees(theta):+.1f}\N{DEGREE SIGN}"
+    dx, dy, degrees = round(x, 2) + 0.0, round(y, 2) + 0.0, round(float(np.degrees(theta)), 1) + 0.0  # + 0.0: never -0.00
+    return f"sensor: dx {dx:+.2f} m, dy {dy:+.2f} m, d\N{GREEK SMALL LETTER THETA} {degrees:+.1f}\N{DEGREE SIGN}"
 
 
 def _mistakes(wrong: Bools | None, scene: _Scene) -> str:
     if wrong is None:
         return ""
     judged = int((np.isfinite(scene.source[:, 0]) & ~scene.faint).sum())
-    return f"; {int(wrong.sum())} of {judged} points wrong"
+    return f"{int(wrong.sum())} of {judged} wrong"

@@ -1,0 +1,85 @@
+"""Robust rigid registration of many hypotheses at once: one scan against another from H starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference.surface import Surface
+
+
+def nearest_points(moved: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance to and index of the nearest target point. moved: (..., P, 2); target: (M, 2). Returns (..., P) each."""
+    flat = moved.reshape(-1, 2)
+    distance, index = torch.cdist(flat, target, compute_mode="donot_use_mm_for_euclid_dist").min(-1)
+    return distance.view(moved.shape[:-1]), index.view(moved.shape[:-1])
+
+
+def gauss_newton_step(moved: Tensor, partner: Tensor, tangent: Tensor, weights: Tensor, along: float) -> Tensor:
+    """One least-squares step of a rigid motion, applied after the present one.
+
+    Minimises sum_i w_i (r^T (I - (1 - along) t t^T) r): point-to-point at along = 1, point-to-line at 0.
+
+    Args:
+        moved, partner, tangent: (H, P, 2); weights: (H, P).
+
+    Returns:
+        (H, 3).
+    """
+    residual = moved - partner
+    jacobian = torch.stack([-moved[..., 1], moved[..., 0]], dim=-1)  # d moved / d theta
+    centre = (weights[..., None] * moved).sum(-2, keepdim=True) / weights.sum(-1)[..., None, None].clamp(min=1e-9)
+    lever = torch.stack([-(moved - centre)[..., 1], (moved - centre)[..., 0]], dim=-1)  # rotation about the weighted centre
+    slack = 1 - along
+
+    def dot_metric(a: Tensor, b: Tensor) -> Tensor:
+        return (a * b).sum(-1) - slack * (a * tangent).sum(-1) * (b * tangent).sum(-1)
+
+    ex = torch.zeros_like(lever)
+    ex[..., 0] = 1
+    ey = torch.zeros_like(lever)
+    ey[..., 1] = 1
+    basis = (lever, ex, ey)
+    total = weights.sum(-1).clamp(min=1e-9)
+    normal = torch.stack([torch.stack([(weights * dot_metric(a, b)).sum(-1) for b in basis], -1) for a in basis], -2)
+    right = torch.stack([-(weights * dot_metric(a, residual)).sum(-1) for a in basis], -1)
+    scale = (weights * (lever**2).sum(-1)).sum(-1)
+    damping = torch.stack([1e-4 * scale + 1e-6 * total, 1e-3 * total, 1e-3 * total], dim=-1)
+    step = torch.linalg.solve(normal + torch.diag_embed(damping), right)
+    del jacobian
+    theta, shift = step[..., 0].clamp(-0.5, 0.5), step[..., 1:]
+    pivot = centre[..., 0, :]
+    return torch.cat([theta[..., None], pivot - se2.rotate(theta, pivot) + shift], dim=-1)
+
+
+def register(
+    source: Tensor,
+    weights: Tensor,
+    target: Surface,
+    motions: Tensor,
+    gates: Sequence[float],
+    along: Sequence[float],
+) -> Tensor:
+    """Iterated closest points with robust (Geman-McClure) weights and a shrinking gate.
+
+    Args:
+        source: (P, 2) points. weights: (P,) or (H, P), e.g. a segment's membership.
+        target: the other scan.
+        motions: (H, 3) starts.
+        gates: residual, in metres, at which a point's weight has fallen to a quarter; one per iteration.
+        along: how much of the residual along the surface counts, one per iteration (1 = point to point).
+
+    Returns:
+        (H, 3) refined motions.
+    """
+    for gate, slack in zip(gates, along, strict=True):
+        moved = se2.apply(motions, source)  # (H, P, 2)
+        distance, index = nearest_points(moved, target.points)
+        unit = gate + target.spacing[index] / 2
+        robust = weights / (1 + (distance / unit) ** 2) ** 2
+        step = gauss_newton_step(moved, target.points[index], target.tangent[index], robust, slack)
+        motions = se2.compose(step, motions)
+    return motions
