@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -67,3 +67,153 @@ class SimulatorConfig:
         for name, (is_met, expected) in rules.items():
             if not is_met:
                 raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
+
+
+def _choose(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value}")
+
+
+@dataclass(frozen=True)
+class InferenceConfig:
+    """How the model is decoded (spec 7).
+
+    Attributes:
+        clusters: D, states of the clustering chain: background, movers, outlier.
+        candidates: K inlier states of a point, nearest under the motions; 0 = every target point (dense).
+        schedule: `sweep` (exact passes over each chain, motions between) or `flooding` (Algorithm 1 node by node).
+        flooding_order: `alternate` or `ascending` (A-20), for flooding only.
+        iterations: rounds at most.
+        stop_early: stop when everything has settled; off, exactly `iterations` rounds are unrolled.
+        temperature: 0 = max-product, 1 = sum-product.
+        motion_weights: `hard` (labels, the paper's) or `soft` (beliefs; lets gradients reach the weights).
+        motion_metric: `point` (Kabsch, the paper's) or `line` (robust point-to-line step).
+        min_extent: metres; a cluster smaller than this takes the background's rotation.
+        rotation_tolerance, translation_tolerance: radians and metres below which a motion has settled.
+    """
+
+    clusters: int = 8
+    candidates: int = 8
+    schedule: str = "sweep"
+    flooding_order: str = "alternate"
+    iterations: int = 10
+    stop_early: bool = True
+    temperature: float = 0.0
+    motion_weights: str = "hard"
+    motion_metric: str = "line"
+    min_extent: float = 0.1
+    rotation_tolerance: float = 1e-4
+    translation_tolerance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        _choose("schedule", self.schedule, ("sweep", "flooding"))
+        _choose("flooding_order", self.flooding_order, ("alternate", "ascending"))
+        _choose("motion_weights", self.motion_weights, ("hard", "soft"))
+        _choose("motion_metric", self.motion_metric, ("point", "line"))
+        if self.clusters < 2:
+            raise ValueError(f"clusters: expected at least 2 (background and outlier), got {self.clusters}")
+        for name in ("candidates", "iterations", "temperature"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class FeatureConfig:
+    """Which features the model has.
+
+    Attributes:
+        raw_channels: the 12 local channels enter the potentials beside the boosted scores (W-A); off, they only feed the boosters
+            (W-B, the literal text).
+        wrap_closed: neighbours wrap round a closed scan (A-06); off, they clamp as in the paper.
+        stumps: decision stumps in each booster.
+    """
+
+    raw_channels: bool = True
+    wrap_closed: bool = True
+    stumps: int = 50
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Everything that `save_pretrained` writes beside the weights.
+
+    Attributes:
+        chains: `joint`, or one chain alone: `matching`, `clustering`.
+        start: `search` (hypotheses over the whole scene) or `paper` (spec 7.3: association chain, then runs of residuals).
+    """
+
+    chains: str = "joint"
+    start: str = "search"
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    inference: InferenceConfig = field(default_factory=InferenceConfig)
+
+    def __post_init__(self) -> None:
+        _choose("chains", self.chains, ("joint", "matching", "clustering"))
+        _choose("start", self.start, ("search", "paper"))
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """How the model is learned (spec 2, 6).
+
+    Attributes:
+        rotation_noise, translation_noise: radians and metres of noise on the true motions.
+        start_share: share of the pairs whose features see InitialiseRT's motions instead.
+        predicted_share: share of the pairs whose clustering features see predicted associations (A-28).
+        folds: parts of the training pairs for out-of-fold margins; sequences stay whole. 0: margins on the same pairs (faithful).
+        negatives: wrong pairs per true one for the data booster.
+        prior: standard deviation s_w of the weights' Gaussian prior, on standardised features.
+        max_steps, tolerance: L-BFGS steps at most, and gradient per node at which it stops.
+        batch_size: pairs that are looked at at once.
+        seed: of everything drawn while learning.
+    """
+
+    rotation_noise: float = 0.005
+    translation_noise: float = 0.02
+    start_share: float = 0.5
+    predicted_share: float = 0.5
+    folds: int = 4
+    negatives: int = 4
+    prior: float = 10.0
+    max_steps: int = 200
+    tolerance: float = 1e-4
+    batch_size: int = 16
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Where annotated pairs come from: files, the simulator, or both.
+
+    Attributes:
+        train, test: files, folders or glob patterns of pair files.
+        simulate_train, simulate_test: simulated worlds, `pairs` pairs each; worlds of train and test never share a seed.
+        pairs, sequences: of every simulated world.
+        seed: of the simulator.
+    """
+
+    train: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    simulate_train: tuple[SimulatorConfig, ...] = (SimulatorConfig(),)
+    simulate_test: tuple[SimulatorConfig, ...] = (SimulatorConfig(),)
+    pairs: int = 31
+    sequences: int = 8
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Config:
+    """One run of `train.py`.
+
+    Attributes:
+        output: run folder; resolved config, versions, model, metrics, events and pictures go there.
+        overfit: train and test on the first training pair alone, a quick check that everything can learn.
+        compare_chains: also fit and evaluate CRF-Matching and CRF-Clustering alone.
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    learning: LearningConfig = field(default_factory=LearningConfig)
+    output: str = "runs/default"
+    overfit: bool = False
+    compare_chains: bool = True

@@ -1,35 +1,76 @@
-"""The start of the moving objects (InitialiseRT, second half): many hypothesised motions, the few that explain what the background cannot."""
+"""The start of the moving objects (InitialiseRT, second half): many hypothesised motions, and a learned score of which to accept.
+
+The background leaves points of both scans unexplained. Every segment of the first scan that holds some is carried to every such
+segment of the second and registered there; that pool nearly always holds the movers' motions, and a hundred wrong ones. A
+log-linear score of features in units of local spacing tells them apart (design finding 14).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.background import unit_length
 from torchcrf_scan.inference.registration import nearest_points, register
-from torchcrf_scan.inference.surface import Surface, carry_back, look_along
+from torchcrf_scan.inference.surface import Sight, Surface, carry_back, look_along
 
 TRUNCATION = 3.0  # a residual of three units is as bad as any
-CONTRADICTION = 3.0  # more units for a point that the other scan sees through
-HIDDEN = 1.0  # at most this many units where the other scan could not have seen the point
-UNMEASURED = 2.0  # and where its beams returned nothing, though a surface once seen there should be seen again
+OPEN = 1.5  # units from which a point is not explained
+EXPLAINED = 1.0  # units up to which it is explained well
 MIN_POINTS = 3
+SEGMENT_GAP = 8.0  # two unexplained segments this many spacings apart may be one object, seen with a beam missing
 FASTEST = 45.0  # metres per second; no road vehicle moves more per second
-FARTHEST = 0.6  # nor across more than this share of its range
+FARTHEST = 1.0  # nor farther than this share of its range
+SCREEN_POINTS = 8  # of a segment, to compare starts
+STARTS = 6  # of a segment, to register
+REGISTER_POINTS = 24
+FEATURE_POINTS = 40
+USUAL_TURN = 0.1  # radians, standard deviation of a mover's turn between two scans
+SHARED = 0.4  # share of points in common from which two hypotheses compete
+
+FEATURES = (
+    *("size", "share_of_segment", "extent", "linearity", "range"),
+    *("residual", "gain", "total_gain", "explained", "open_before", "occluded_before", "seen_through_before"),
+    *("seen_through", "occluded", "distinct", "landing_open", "landing_seen_through_before"),
+    *("target_open", "target_residual", "target_gain", "target_total_gain", "target_cover"),
+    *("displacement", "displacement_in_spacings", "displacement_in_range", "displacement_in_extent", "along_surface", "rotation"),
+)
 
 
-def explain(moved: Tensor, other: Surface) -> Tensor:
-    """(H, P) units that every point leaves unexplained when carried to (H, P, 2) in the frame of `other`."""
+@dataclass(frozen=True, slots=True)
+class Leftover:
+    """What a background motion leaves unexplained.
+
+    Attributes:
+        source: (P,), target: (M,) residual in units, at most `TRUNCATION`.
+        source_sight: what the target's beams say of the source's points, target_sight: the reverse.
+    """
+
+    source: Tensor
+    target: Tensor
+    source_sight: Sight
+    target_sight: Sight
+
+    @classmethod
+    def of(cls, source: Surface, target: Surface, background: Tensor) -> Leftover:
+        """background: (3,)."""
+        forward, backward = se2.apply(background, source.points), se2.apply(se2.inverse(background), target.points)
+        ahead, back = look_along(forward, target), look_along(backward, source)
+        return cls(residual_units(forward, target), residual_units(backward, source), ahead, back)
+
+
+def point_units(surface: Surface) -> Tensor:
+    """(P,) metres: how far from a point of the surface a well registered point of another scan may lie."""
+    return surface.spacing / 2 + 2 * surface.noise
+
+
+def residual_units(moved: Tensor, other: Surface) -> Tensor:
+    """(...,) distance to the other scan in its local units, truncated. moved: (..., 2) in its frame."""
     distance, index = nearest_points(moved, other.points)
-    unit = other.spacing[index] / 2 + 2 * other.noise
-    residual = (distance / unit).clamp(max=TRUNCATION)
-    sight = look_along(moved, other)
-    residual = torch.where(sight.occluded, residual.clamp(max=HIDDEN), residual)
-    residual = torch.where(sight.unmeasured, residual.clamp(max=UNMEASURED), residual)
-    return residual + CONTRADICTION * (sight.seen_through & (residual >= TRUNCATION))
+    return (distance / point_units(other)[index]).clamp(max=TRUNCATION)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,44 +85,52 @@ class Hypotheses:
     motions: Tensor
     members: Tensor
 
+    def __len__(self) -> int:
+        return len(self.motions)
 
-def hypothesise(
-    source: Surface, target: Surface, background: Tensor, open_source: Tensor, open_target: Tensor, dt: float
-) -> Hypotheses:
+
+def hypothesise(source: Surface, target: Surface, background: Tensor, dt: float) -> Hypotheses:
     """Aligns every segment holding unexplained points with every such segment of the other scan.
 
-    By centroid and by both ends (a car is seen to another length in every scan), then by robust registration.
+    By centroid and by both ends (a car is seen to another length in every scan); the best starts are registered.
 
     Args:
-        background: (3,). open_source: (P,), open_target: (M,) bool, unexplained by the background. dt: seconds.
+        background: (3,).
+        dt: seconds between the scans.
     """
-    of_source, of_target = _open_segments(source, open_source), _open_segments(target, open_target)
-    carried = se2.apply(background, source.points)
-    marks_source, marks_target = _landmarks(carried, of_source), _landmarks(target.points, of_target)  # (S, 3, 2), (T, 3, 2)
-    shift = marks_target[None] - marks_source[:, None]  # (S, T, 3, 2)
-    stay = torch.zeros_like(shift[:, :1, :1])
-    shift = torch.cat([shift.flatten(1, 2), stay.flatten(1, 2)], dim=1)  # (S, 3T+1, 2)
-    ranges = torch.linalg.vector_norm(marks_source[:, :1], dim=-1)  # (S, 1)
-    reach = torch.minimum(ranges * FARTHEST, ranges.new_tensor(FASTEST * dt))
-    which, start = (torch.linalg.vector_norm(shift, dim=-1) <= reach).nonzero(as_tuple=True)
-    added = torch.cat([torch.zeros_like(shift[which, start, :1]), shift[which, start]], dim=-1)
-    motions = se2.compose(added, background.expand_as(added))
-    members = of_source[which]
-    unit = float(unit_length(source, target))
-    gates = [unit * g for g in (4.0, 3.0, 2.0, 2.0, 1.5, 1.5)]
-    motions = register(source.points, members.to(source.points), target, motions, gates, [1.0, 1.0, 0.5, 0.5, 0.2, 0.2])
-    return Hypotheses(motions, members)
+    leftover = Leftover.of(source, target, background)
+    groups, landing = _groups(source, leftover.source >= OPEN), _groups(target, leftover.target >= OPEN)
+    if not len(groups):
+        return Hypotheses(background.new_zeros(0, 3), groups)
+    shift = _shifts(se2.apply(background, source.points), groups, target, landing, dt)  # (S, A, 2)
+    shift = _screen(shift, source, groups, target, background)  # (S, K, 2)
+    added = torch.cat([torch.zeros_like(shift[..., :1]), shift], dim=-1)
+    motions = se2.compose(added, background.expand_as(added))  # (S, K, 3)
+    which, start = shift.isfinite().all(-1).nonzero(as_tuple=True)
+    return _settle(motions[which, start], groups[which], source, target, background)
 
 
-def _open_segments(surface: Surface, is_open: Tensor) -> Tensor:
-    """(S, P) bool: members of every segment with enough unexplained points, alone and joined with the next such segment."""
+def _groups(surface: Surface, is_open: Tensor) -> Tensor:
+    """(S, P) bool: segments with unexplained points, the unexplained part of each, and neighbours joined."""
     count = int(surface.segment.max()) + 1
-    members = surface.segment[None] == torch.arange(count, device=surface.segment.device)[:, None]
-    enough = (members & is_open).any(-1)
-    members = members[enough & (members.sum(-1) >= MIN_POINTS)]
-    parts = members & is_open  # an object before a wall may share its segment: its open part is tried alone, too
-    partial = (parts.sum(-1) >= MIN_POINTS) & (parts.sum(-1) < 0.7 * members.sum(-1))
-    return torch.cat([members, parts[partial]])
+    members = surface.segment[None] == torch.arange(count, device=is_open.device)[:, None]
+    members = members[(members & is_open).any(-1)]
+    parts = members & is_open  # an object before a wall may share its segment
+    is_part = (parts.sum(-1) >= MIN_POINTS) & (parts.sum(-1) < 0.7 * members.sum(-1))
+    pairs = members | members.roll(-1, 0)
+    pairs = pairs[_are_near(surface, members)]
+    groups = torch.cat([members, parts[is_part], pairs])
+    return groups[groups.sum(-1) >= MIN_POINTS]
+
+
+def _are_near(surface: Surface, members: Tensor) -> Tensor:
+    """(S,) bool: a segment's end lies near the start of the next listed one."""
+    if len(members) < 2:
+        return members.new_zeros(len(members))
+    marks = _landmarks(surface.points, members)
+    gap = torch.linalg.vector_norm(marks[:, 2] - marks.roll(-1, 0)[:, 1], dim=-1)
+    footprint = torch.linalg.vector_norm(marks[:, 2], dim=-1) * surface.step
+    return (gap < SEGMENT_GAP * footprint + 6 * surface.noise) & (len(members) > 2 or torch.arange(len(members)) == 0)
 
 
 def _landmarks(points: Tensor, members: Tensor) -> Tensor:
@@ -94,45 +143,290 @@ def _landmarks(points: Tensor, members: Tensor) -> Tensor:
     return torch.stack([centroid, points[first], points[last]], dim=1)
 
 
-def select(
-    hypotheses: Hypotheses, source: Surface, target: Surface, background: Tensor, most: int, price: float, price_per_unit: float
-) -> Tensor:
-    """Greedy choice: the motion that explains most of what is still open, both ways, until none is worth its price.
+def _shifts(carried: Tensor, groups: Tensor, target: Surface, landing: Tensor, dt: float) -> Tensor:
+    """(S, A, 2) translations of every group after the background's motion; NaN where none could move so far."""
+    marks, goals = _landmarks(carried, groups), _landmarks(target.points, landing)
+    shift = (goals[None] - marks[:, None]).flatten(1, 2)  # (S, 3T, 2)
+    shift = torch.cat([torch.zeros_like(marks[:, :1]), shift], dim=1)
+    reach = (torch.linalg.vector_norm(marks[:, :1], dim=-1) * FARTHEST).clamp(max=FASTEST * dt)
+    return shift.masked_fill((torch.linalg.vector_norm(shift, dim=-1) > reach)[..., None], torch.nan)
+
+
+def _pick(groups: Tensor, most: int) -> tuple[Tensor, Tensor]:
+    """Index (S, L) of at most `most` members of every group, evenly spread, and (S, L) whether it is one."""
+    size = groups.sum(-1)
+    first = size.cumsum(0) - size
+    longest = int(size.clamp(max=most).max())
+    place = torch.arange(longest, device=groups.device)[None]
+    rank = torch.where(size[:, None] > most, place * size[:, None] // longest, place)
+    is_member = rank < size[:, None]
+    flat = (first[:, None] + rank).clamp(max=int(size.sum()) - 1)
+    return groups.nonzero()[:, 1][flat], is_member
+
+
+def _screen(shift: Tensor, source: Surface, groups: Tensor, target: Surface, background: Tensor) -> Tensor:
+    """(S, K, 2) starts whose residual is least and which differ; NaN where a group has fewer."""
+    index, is_member = _pick(groups, SCREEN_POINTS)
+    points = se2.apply(background, source.points)[index]  # (S, L, 2)
+    units = residual_units(points[:, None] + shift.nan_to_num()[:, :, None], target)  # (S, A, L)
+    cost = (units * is_member[:, None]).sum(-1) / is_member.sum(-1)[:, None]
+    cost = cost.masked_fill(shift.isnan().any(-1), torch.inf)
+    near = 2 * unit_length(source, target)
+    kept = []
+    for _ in range(min(STARTS, shift.shape[1])):
+        least, best = cost.min(-1)
+        chosen = shift.gather(1, best[:, None, None].expand(-1, 1, 2))  # (S, 1, 2)
+        cost = cost.masked_fill(torch.linalg.vector_norm(shift - chosen, dim=-1) < near, torch.inf)
+        kept.append(chosen.masked_fill(least.isinf()[:, None, None], torch.nan))
+    return torch.cat(kept, dim=1)
+
+
+def _settle(motions: Tensor, members: Tensor, source: Surface, target: Surface, background: Tensor) -> Hypotheses:
+    """Registers every start; few points say little of a turn."""
+    index, is_member = _pick(members, REGISTER_POINTS)
+    points, weights = source.points[index], is_member.to(source.points)
+    unit = float(unit_length(source, target))
+    gates, along = [unit * gate for gate in (4.0, 3.0, 2.0, 2.0, 1.5, 1.5)], [1.0, 1.0, 0.5, 0.5, 0.2, 0.2]
+    motions = register(points, weights, target, motions, gates, along)
+    return Hypotheses(_steady(motions, points, weights, background, unit_length(source, target)), members)
+
+
+def _steady(motions: Tensor, points: Tensor, weights: Tensor, background: Tensor, unit: Tensor) -> Tensor:
+    """Turns every motion back towards the background's heading about its points' centre, as far as they cannot tell.
 
     Args:
-        most: movers at most. price: units that a mover must explain at least. price_per_unit: more for every unit it moved.
-
-    Returns:
-        (G, 3) motions of the accepted movers.
+        motions: (H, 3). points: (H, L, 2), weights: (H, L). unit: () metres, the error of a point.
     """
-    motions, members = hypotheses.motions, hypotheses.members
-    open_forward = explain(se2.apply(background, source.points)[None], target)[0]  # (P,)
-    open_backward = explain(carry_back(background[None], target.points), source)[0]  # (M,)
-    if not len(motions):
-        return motions
-    moved = se2.apply(motions, source.points)  # (H, P, 2)
-    forward = torch.where(members, explain(moved, target), torch.inf)
-    backward = _covered(moved, members, target)
-    centroid = _landmarks(se2.apply(background, source.points), members)[:, :1]
-    undone = se2.compose(motions, se2.inverse(background).expand_as(motions))
-    travel = torch.linalg.vector_norm(se2.apply(undone, centroid) - centroid, dim=-1)[:, 0]
-    cost = price + price_per_unit * travel / unit_length(source, target)
+    moved = se2.apply(motions, points)
+    centre = (weights[..., None] * moved).sum(1) / weights.sum(-1, keepdim=True)
+    told = (weights * ((moved - centre[:, None]) ** 2).sum(-1)).sum(-1) / unit**2  # 1 / variance of the heading
+    turn = -se2.wrap(motions[:, 0] - background[0]) / (1 + told * USUAL_TURN**2)
+    back = torch.cat([turn[:, None], centre - se2.rotate(turn, centre)], dim=-1)
+    return se2.compose(back, motions)
+
+
+@dataclass(frozen=True, slots=True)
+class _Landing:
+    """Where every hypothesis carries its members: index (H, L) of these, is_member (H, L), and how they lie in the target.
+
+    Attributes:
+        moved: (H, L, 2).
+        units: (H, L) truncated residual. nearest: (H, L) target point.
+        target_units: (H, M) residual of every target point to the nearest member, not truncated.
+    """
+
+    index: Tensor
+    is_member: Tensor
+    moved: Tensor
+    units: Tensor
+    nearest: Tensor
+    target_units: Tensor
+
+    @classmethod
+    def of(cls, hypotheses: Hypotheses, source: Surface, target: Surface) -> _Landing:
+        index, is_member = _pick(hypotheses.members, FEATURE_POINTS)
+        moved = se2.apply(hypotheses.motions, source.points[index])
+        distance = torch.cdist(moved.flatten(0, 1), target.points, compute_mode="donot_use_mm_for_euclid_dist")
+        distance = distance.view(*index.shape, -1)  # (H, L, M)
+        least, nearest = distance.min(-1)
+        unit = point_units(target)
+        back = distance.masked_fill_(~is_member[..., None], torch.inf).amin(1)
+        return cls(index, is_member, moved, (least / unit[nearest]).clamp(max=TRUNCATION), nearest, back / unit)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """(H,) mean over the members. values: (H, L)."""
+        return (values.to(self.units) * self.is_member).sum(-1) / self.is_member.sum(-1)
+
+
+def hypothesis_features(hypotheses: Hypotheses, source: Surface, target: Surface, background: Tensor) -> Tensor:
+    """(H, F) what tells a mover's motion from a wrong one, in the order of `FEATURES`; shares, logarithms and local units only."""
+    if not len(hypotheses):
+        return background.new_zeros(0, len(FEATURES))
+    leftover = Leftover.of(source, target, background)
+    landing = _Landing.of(hypotheses, source, target)
+    columns = (
+        *_shape_features(hypotheses, landing, source),
+        *_source_features(landing, leftover, hypotheses, target),
+        *_target_features(landing, leftover, source, target),
+        *_motion_features(hypotheses, landing, source, background),
+    )
+    return torch.stack(columns, dim=-1)
+
+
+def _extent(landing: _Landing, source: Surface) -> tuple[Tensor, Tensor]:
+    """(H,) standard deviations of the members along and across their main direction, metres."""
+    points = source.points[landing.index]
+    centred = points - torch.stack([landing.mean(points[..., 0]), landing.mean(points[..., 1])], dim=-1)[:, None]
+    xx, yy = landing.mean(centred[..., 0] ** 2), landing.mean(centred[..., 1] ** 2)
+    xy = landing.mean(centred[..., 0] * centred[..., 1])
+    spread = (((xx - yy) / 2) ** 2 + xy**2).sqrt()
+    middle = (xx + yy) / 2
+    return (middle + spread).clamp(min=0).sqrt(), (middle - spread).clamp(min=0).sqrt()
+
+
+def _shape_features(hypotheses: Hypotheses, landing: _Landing, source: Surface) -> tuple[Tensor, ...]:
+    size = hypotheses.members.sum(-1).to(source.points)
+    segment_size = torch.bincount(source.segment).to(size)[source.segment]
+    whole = (hypotheses.members * segment_size).sum(-1) / size
+    long, across = _extent(landing, source)
+    unit = landing.mean(point_units(source)[landing.index])
+    ranges = landing.mean(source.ranges[landing.index])
+    return (
+        size.log(),
+        (size / whole).clamp(max=1.0),
+        (long / unit).log1p(),
+        1 - across / long.clamp(min=1e-6),
+        (ranges / source.ranges.median()).log(),
+    )
+
+
+def _source_features(landing: _Landing, leftover: Leftover, hypotheses: Hypotheses, target: Surface) -> tuple[Tensor, ...]:
+    sight = look_along(landing.moved, target)
+    units = torch.where(sight.occluded, landing.units.clamp(max=OPEN), landing.units)
+    before = leftover.source[landing.index]
+    gain = landing.mean(before - units)
+    used = (landing.target_units < OPEN).sum(-1)
+    return (
+        landing.mean(units),
+        gain,
+        (gain.clamp(min=0) * hypotheses.members.sum(-1)).log1p(),
+        landing.mean(units < EXPLAINED),
+        landing.mean(before >= OPEN),
+        landing.mean(leftover.source_sight.occluded[landing.index]),
+        landing.mean(leftover.source_sight.seen_through[landing.index]),
+        landing.mean(sight.seen_through),
+        landing.mean(sight.occluded),
+        (used / hypotheses.members.sum(-1)).log1p(),
+        landing.mean(leftover.target[landing.nearest] >= OPEN),
+        landing.mean(leftover.target_sight.seen_through[landing.nearest]),
+    )
+
+
+def _target_features(landing: _Landing, leftover: Leftover, source: Surface, target: Surface) -> tuple[Tensor, ...]:
+    is_open = leftover.target >= OPEN
+    reach = 6 + _extent(landing, source)[0][:, None] / point_units(target)  # (H, M) units
+    is_near = is_open & (landing.target_units < reach)
+    count = is_near.sum(-1)
+    units = landing.target_units.clamp(max=TRUNCATION)
+    residual = (units * is_near).sum(-1) / count.clamp(min=1)
+    gain = ((leftover.target - units) * is_near).sum(-1)
+    landed = torch.zeros(len(count), int(target.segment.max()) + 1, dtype=torch.bool, device=count.device)
+    landed.scatter_(1, target.segment[landing.nearest], landing.units < OPEN)
+    there = landed[:, target.segment] & is_open  # (H, M)
+    cover = (there & (units < OPEN)).sum(-1) / there.sum(-1).clamp(min=1)
+    return count.to(gain).log1p(), residual, gain / count.clamp(min=1), gain.clamp(min=0).log1p(), cover
+
+
+def _motion_features(hypotheses: Hypotheses, landing: _Landing, source: Surface, background: Tensor) -> tuple[Tensor, ...]:
+    points = source.points[landing.index]
+    step = landing.moved - se2.apply(background, points)  # (H, L, 2)
+    shift = torch.stack([landing.mean(step[..., 0]), landing.mean(step[..., 1])], dim=-1)
+    length = torch.linalg.vector_norm(shift, dim=-1).clamp(min=1e-6)
+    tangent = se2.rotate(background[0], source.tangent[landing.index])
+    along = landing.mean((tangent * shift[:, None]).sum(-1).abs()) / length
+    turn = se2.wrap(hypotheses.motions[:, 0] - background[0]).abs()
+    long = _extent(landing, source)[0]
+    unit = landing.mean(point_units(source)[landing.index])
+    spacing = landing.mean(source.ranges[landing.index]) * source.step
+    return (
+        (length / unit).log1p(),
+        (length / spacing).log1p(),
+        length / landing.mean(source.ranges[landing.index]),
+        (length / long.clamp(min=1e-6)).log1p(),
+        along,
+        (turn / USUAL_TURN).log1p(),
+    )
+
+
+class HypothesisScore(nn.Module):
+    """Probability that a hypothesis is a mover's motion: logistic in the standardised features; `learning.hypothesis_fit` fits it.
+
+    Attributes:
+        mean, scale, weight: (F,), bias: () of the log-linear score.
+        threshold: () probability from which a hypothesis is accepted.
+    """
+
+    mean: Tensor
+    scale: Tensor
+    weight: Tensor
+    bias: Tensor
+    threshold: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(len(FEATURES)))
+        self.register_buffer("scale", torch.ones(len(FEATURES)))
+        self.register_buffer("weight", torch.zeros(len(FEATURES)))
+        self.register_buffer("bias", torch.tensor(0.0))
+        self.register_buffer("threshold", torch.tensor(0.3))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """features: (..., F) by `hypothesis_features`. Returns (...) probabilities."""
+        return (((features - self.mean) / self.scale) @ self.weight + self.bias).sigmoid()
+
+
+@dataclass(frozen=True, slots=True)
+class Movers:
+    """G accepted movers, the surest first.
+
+    Attributes:
+        motions: (G, 3) `T_target_source`.
+        probabilities: (G,).
+        members: (G, P) bool, the source segment that each was found by.
+    """
+
+    motions: Tensor
+    probabilities: Tensor
+    members: Tensor
+
+
+def select(
+    hypotheses: Hypotheses, probabilities: Tensor, source: Surface, target: Surface, *, threshold: float, most: int
+) -> Movers:
+    """Accepts the surest hypothesis, drops what competes with it, and so on: non-maximum suppression.
+
+    Two compete when they move the same points, explain the same points of the second scan, or when the accepted motion explains
+    the other's points as well.
+
+    Args:
+        probabilities: (H,).
+        threshold: least probability. most: movers at most.
+    """
+    likely = (probabilities >= threshold).nonzero()[:, 0]
+    likely = likely[probabilities[likely].argsort(descending=True)]
+    if not len(likely) or not most:
+        return Movers(hypotheses.motions[:0], probabilities[:0], hypotheses.members[:0])
+    pool = Hypotheses(hypotheses.motions[likely], hypotheses.members[likely])
+    rivals = _rivals(pool, source, target)
     accepted: list[int] = []
-    while len(accepted) < most:
-        gain = (open_forward - forward).clamp(min=0).sum(-1) + (open_backward - backward).clamp(min=0).sum(-1)
-        gain = gain - (forward - open_forward).masked_fill(~members, 0).clamp(min=0).sum(-1) - cost
-        best = int(gain.argmax())
-        if float(gain[best]) <= 0:
-            break
-        accepted.append(best)
-        open_forward, open_backward = torch.minimum(open_forward, forward[best]), torch.minimum(open_backward, backward[best])
-    return motions[accepted]
+    for row, beside in enumerate(rivals.tolist()):
+        if len(accepted) < most and not any(beside[k] for k in accepted):
+            accepted.append(row)
+    chosen = likely[accepted]
+    return Movers(hypotheses.motions[chosen], probabilities[chosen], hypotheses.members[chosen])
 
 
-def _covered(moved: Tensor, members: Tensor, target: Surface) -> Tensor:
-    """(H, M) residual of every target point to the nearest member, in units; inf where it is no nearer than the truncation."""
-    dx = target.points[:, 0] - moved[..., None, 0]
-    dy = target.points[:, 1] - moved[..., None, 1]  # (H, P, M)
-    distance = (dx * dx + dy * dy).masked_fill(~members[..., None], torch.inf).amin(1).sqrt()
-    residual = distance / (target.spacing / 2 + 2 * target.noise)
-    return torch.where(residual < TRUNCATION, residual, torch.inf)
+def _rivals(pool: Hypotheses, source: Surface, target: Surface) -> Tensor:
+    """(H, H) bool: hypothesis h competes with g, once g is accepted."""
+    landing = _Landing.of(pool, source, target)
+    same_points = _share_in_common(pool.members) > SHARED
+    same_goal = _share_in_common(landing.target_units < EXPLAINED) > SHARED
+    by_other = residual_units(se2.apply(pool.motions[:, None], source.points[landing.index]), target)  # (g, h, L)
+    count = landing.is_member.sum(-1)
+    by_other = (by_other * landing.is_member).sum(-1) / count
+    as_well = by_other.T < landing.mean(landing.units)[:, None] + 0.5
+    return same_points | same_goal | as_well
+
+
+def _share_in_common(sets: Tensor) -> Tensor:
+    """(H, H) size of the intersections as a share of the smaller set. sets: (H, P) bool."""
+    counted = sets.float()
+    size = counted.sum(-1).clamp(min=1)
+    return counted @ counted.T / torch.minimum(size[:, None], size)
+
+
+def find_movers(source: Surface, target: Surface, background: Tensor, dt: float, score: HypothesisScore, *, most: int = 6) -> Movers:
+    """The moving objects that the background motion (3,) leaves to be explained; dt: seconds between the scans."""
+    hypotheses = hypothesise(source, target, background, dt)
+    probabilities = score(hypothesis_features(hypotheses, source, target, background))
+    return select(hypotheses, probabilities, source, target, threshold=float(score.threshold), most=most)

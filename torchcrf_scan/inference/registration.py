@@ -24,32 +24,28 @@ def gauss_newton_step(moved: Tensor, partner: Tensor, tangent: Tensor, weights: 
     Minimises sum_i w_i (r^T (I - (1 - along) t t^T) r): point-to-point at along = 1, point-to-line at 0.
 
     Args:
-        moved, partner, tangent: (H, P, 2); weights: (H, P).
+        moved, partner, tangent: (..., P, 2); weights: (..., P).
 
     Returns:
-        (H, 3).
+        (..., 3); the identity where all weights are 0. Damped, so finite for any number of points.
     """
     residual = moved - partner
-    jacobian = torch.stack([-moved[..., 1], moved[..., 0]], dim=-1)  # d moved / d theta
     centre = (weights[..., None] * moved).sum(-2, keepdim=True) / weights.sum(-1)[..., None, None].clamp(min=1e-9)
-    lever = torch.stack([-(moved - centre)[..., 1], (moved - centre)[..., 0]], dim=-1)  # rotation about the weighted centre
+    arm = moved - centre
+    lever = torch.stack([-arm[..., 1], arm[..., 0]], dim=-1)  # d moved / d theta, turning about the weighted centre
     slack = 1 - along
 
     def dot_metric(a: Tensor, b: Tensor) -> Tensor:
         return (a * b).sum(-1) - slack * (a * tangent).sum(-1) * (b * tangent).sum(-1)
 
-    ex = torch.zeros_like(lever)
-    ex[..., 0] = 1
-    ey = torch.zeros_like(lever)
-    ey[..., 1] = 1
-    basis = (lever, ex, ey)
+    axes = torch.eye(2, dtype=moved.dtype, device=moved.device)
+    basis = (lever, axes[0].expand_as(lever), axes[1].expand_as(lever))
     total = weights.sum(-1).clamp(min=1e-9)
     normal = torch.stack([torch.stack([(weights * dot_metric(a, b)).sum(-1) for b in basis], -1) for a in basis], -2)
     right = torch.stack([-(weights * dot_metric(a, residual)).sum(-1) for a in basis], -1)
     scale = (weights * (lever**2).sum(-1)).sum(-1)
     damping = torch.stack([1e-4 * scale + 1e-6 * total, 1e-3 * total, 1e-3 * total], dim=-1)
     step = torch.linalg.solve(normal + torch.diag_embed(damping), right)
-    del jacobian
     theta, shift = step[..., 0].clamp(-0.5, 0.5), step[..., 1:]
     pivot = centre[..., 0, :]
     return torch.cat([theta[..., None], pivot - se2.rotate(theta, pivot) + shift], dim=-1)

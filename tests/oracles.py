@@ -1,0 +1,225 @@
+"""Slow and obvious twins of what the package computes: plain float64 loops that share no code with it.
+
+Chains are enumerated labelling by labelling, features are double loops over i and j. Points are sequences of (x, y), motions of
+(theta, tx, ty); states count from 0 and the outlier is the last.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+KAPPA = 9.0
+ORDERS = (1, 3, 5)
+
+
+# Chains. unary: (N, S), pairwise: (N-1, S, S), row = state of node i, column = state of node i + 1.
+
+
+def labellings(unary: np.ndarray) -> Iterator[tuple[int, ...]]:
+    nodes, states = unary.shape
+    return itertools.product(range(states), repeat=nodes)
+
+
+def score(unary: np.ndarray, pairwise: np.ndarray, labels: Sequence[int]) -> float:
+    total = 0.0
+    for i, state in enumerate(labels):
+        total += float(unary[i, state])
+        if i > 0:
+            total += float(pairwise[i - 1, labels[i - 1], state])
+    return total
+
+
+def log_sum_exp(values: Sequence[float]) -> float:
+    peak = max(values)
+    if peak == -math.inf:
+        return -math.inf
+    return peak + math.log(sum(math.exp(value - peak) for value in values))
+
+
+def log_partition(unary: np.ndarray, pairwise: np.ndarray, temperature: float = 1.0) -> float:
+    scores = [score(unary, pairwise, labels) for labels in labellings(unary)]
+    return max(scores) if temperature == 0 else temperature * log_sum_exp([s / temperature for s in scores])
+
+
+def log_marginals(unary: np.ndarray, pairwise: np.ndarray, temperature: float = 1.0) -> np.ndarray:
+    """(N, S): log probability of every state; at temperature 0 the max-marginals, normalised the same way."""
+    out = np.empty(unary.shape)
+    for i, state in np.ndindex(*unary.shape):
+        scores = [score(unary, pairwise, labels) for labels in labellings(unary) if labels[i] == state]
+        out[i, state] = max(scores) if temperature == 0 else log_sum_exp([s / temperature for s in scores])
+    return np.array([[value - log_sum_exp(list(row)) for value in row] for row in out])
+
+
+def best_labelling(unary: np.ndarray, pairwise: np.ndarray) -> tuple[int, ...]:
+    return max(labellings(unary), key=lambda labels: score(unary, pairwise, labels))
+
+
+# Geometry.
+
+
+def move(motion: Sequence[float], point: Sequence[float]) -> tuple[float, float]:
+    theta, tx, ty = motion
+    x, y = point
+    return math.cos(theta) * x - math.sin(theta) * y + tx, math.sin(theta) * x + math.cos(theta) * y + ty
+
+
+def wrap(angle: float) -> float:
+    while angle > math.pi:
+        angle -= 2 * math.pi
+    while angle <= -math.pi:
+        angle += 2 * math.pi
+    return angle
+
+
+def fit_cost(motion: Sequence[float], source: np.ndarray, target: np.ndarray, weights: Sequence[float]) -> float:
+    """Weighted sum of squared distances that the best rigid motion makes smallest."""
+    return sum(w * math.dist(move(motion, p), q) ** 2 for w, p, q in zip(weights, source, target, strict=True))
+
+
+# Features.
+
+
+def robust(error: float, scale: float) -> float:
+    return -min((error / scale) ** 2, KAPPA)
+
+
+def neighbour(i: int, offset: int, count: int, closed: bool) -> int:
+    return (i + offset) % count if closed else min(max(i + offset, 0), count - 1)
+
+
+def distance_to(points: np.ndarray, i: int, offset: int, closed: bool) -> float:
+    return math.dist(points[neighbour(i, offset, len(points), closed)], points[i])
+
+
+def geodesic_to(points: np.ndarray, i: int, offset: int, closed: bool) -> float:
+    sign = 1 if offset > 0 else -1
+    walk = [points[neighbour(i, sign * step, len(points), closed)] for step in range(abs(offset) + 1)]
+    return sum(math.dist(a, b) for a, b in itertools.pairwise(walk))
+
+
+def angle_between(points: np.ndarray, i: int, k: int, closed: bool) -> float:
+    before, after = (points[neighbour(i, offset, len(points), closed)] for offset in (-k, k))
+    u = (before[0] - points[i][0], before[1] - points[i][1])
+    v = (after[0] - points[i][0], after[1] - points[i][1])
+    if math.hypot(*u) < 1e-6 or math.hypot(*v) < 1e-6:
+        return math.pi
+    angle = math.atan2(u[0] * v[1] - u[1] * v[0], u[0] * v[0] + u[1] * v[1])
+    return angle if angle >= 0 else angle + 2 * math.pi
+
+
+def local_association(
+    source: np.ndarray,
+    target: np.ndarray,
+    scales: Sequence[float],
+    initial_motion: Sequence[float],
+    moved: np.ndarray,
+    source_closed: bool = False,
+    target_closed: bool = False,
+) -> np.ndarray:
+    """L1..L12: (N, M, 12). `moved` are the source points under the motion of their own cluster."""
+    out = np.empty((len(source), len(target), 12))
+    for i, j in np.ndindex(len(source), len(target)):
+        for c, k in enumerate(ORDERS):
+            for channel, measure in ((c, distance_to), (6 + c, geodesic_to)):
+                errors = [measure(source, i, s * k, source_closed) - measure(target, j, s * k, target_closed) for s in (1, -1)]
+                out[i, j, channel] = sum(robust(error, scales[channel]) for error in errors) / 2
+            turn = angle_between(source, i, k, source_closed) - angle_between(target, j, k, target_closed)
+            out[i, j, 3 + c] = robust(wrap(turn), scales[3 + c])
+        out[i, j, 9] = robust(math.hypot(*source[i]) - math.hypot(*target[j]), scales[9])
+        out[i, j, 10] = robust(math.dist(move(initial_motion, source[i]), target[j]), scales[10])
+        out[i, j, 11] = robust(math.dist(moved[i], target[j]), scales[11])
+    return out
+
+
+def pairwise_association(source: np.ndarray, target: np.ndarray, scales: Sequence[float], outlier: Sequence[float]) -> np.ndarray:
+    """P1..P4: (N-1, M+1, M+1, 4). `outlier` holds P3 and P4 where a state is the outlier."""
+    M = len(target)
+    out = np.zeros((len(source) - 1, M + 1, M + 1, 4))
+    for i, m, n in np.ndindex(len(source) - 1, M + 1, M + 1):
+        if m == M or n == M:
+            out[i, m, n] = (0, m != n, *outlier)
+            continue
+        v1, v2 = source[i + 1] - source[i], target[n] - target[m]
+        out[i, m, n, 0] = n == m + 1
+        out[i, m, n, 2] = robust(math.hypot(*v1) - math.hypot(*v2), scales[0])
+        out[i, m, n, 3] = robust(math.hypot(*(v1 - v2)), scales[1])
+    return out
+
+
+def partner(motion: Sequence[float], point: np.ndarray, target: np.ndarray, association: int) -> np.ndarray:
+    """The associated target point, or the nearest under the motion where the point is an outlier."""
+    if association >= 0:
+        return target[association]
+    moved = move(motion, point)
+    return min(target, key=lambda q: math.dist(moved, q))
+
+
+def local_clustering(
+    source: np.ndarray,
+    target: np.ndarray,
+    motions: np.ndarray,
+    active: Sequence[bool],
+    association: Sequence[int],
+    cluster_distance: float,
+    outlier_threshold: float,
+) -> np.ndarray:
+    """C1..C4: (N, D, 4)."""
+    C = len(motions)
+    out = np.zeros((len(source), C + 1, 4))
+    for i, p in enumerate(source):
+        residual = [math.dist(move(g, p), partner(g, p, target, association[i])) for g in motions]
+        is_inlier = association[i] >= 0
+        for k in range(C):
+            out[i, k] = (robust(residual[k], cluster_distance), 0, is_inlier, 0)
+        best = min((residual[k] for k in range(C) if active[k]), default=math.inf)
+        out[i, C] = (0, best > outlier_threshold, 0, not is_inlier)
+    return out
+
+
+def pairwise_clustering(
+    source: np.ndarray,
+    target: np.ndarray,
+    motions: np.ndarray,
+    association: Sequence[int],
+    neighbour_weight: float,
+    neighbour_distance: float,
+) -> np.ndarray:
+    """Q1..Q8: (N-1, D, D, 8)."""
+    C = len(motions)
+    out = np.zeros((len(source) - 1, C + 1, C + 1, 8))
+    for i in range(len(source) - 1):
+        d1 = math.dist(source[i], source[i + 1])
+        near = math.exp(-(d1**2) / neighbour_weight**2)
+        has_both = association[i] >= 0 and association[i + 1] >= 0
+        d2 = math.dist(target[association[i]], target[association[i + 1]]) if has_both else math.nan
+        stiff = math.exp(-((d2 - d1) ** 2) / neighbour_distance**2)
+        for k, m in np.ndindex(C + 1, C + 1):
+            entry = out[i, k, m]
+            entry[0] = k == m
+            entry[7] = (k == C) != (m == C)
+            if k == C or m == C:
+                continue
+            if k == m:
+                entry[1] = near
+                if has_both:
+                    entry[3] = stiff
+                    entry[5] = robust(d2 - d1, neighbour_distance)
+            else:
+                entry[2] = 1 - near
+                if has_both:
+                    entry[4] = 1 - stiff
+                parted = math.dist(move(motions[k], source[i]), move(motions[m], source[i + 1]))
+                entry[6] = robust(parted - d1, neighbour_distance)
+    return out
+
+
+def stump_sum(
+    phi: Sequence[float], feature: Sequence[int], threshold: Sequence[float], left: Sequence[float], right: Sequence[float]
+) -> float:
+    """Margin of an ensemble of decision stumps, one after the other."""
+    total = 0.0
+    for f, limit, low, high in zip(feature, threshold, left, right, strict=True):
+        total += low if phi[f] <= limit else high
+    return total

@@ -1,0 +1,52 @@
+"""What many tests share: one comparison with one tolerance table, and scans made from a seed."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-9}  # relative and absolute
+
+
+def assert_close(actual: Tensor, expected: Any, *, tolerance: float | None = None) -> None:
+    """Same shape, same infinities and NaN, and values within the tolerance of `actual`'s dtype (exact for whole numbers)."""
+    within = TOLERANCE.get(actual.dtype, 0.0) if tolerance is None else tolerance
+    wanted = torch.as_tensor(expected)
+    if actual.is_floating_point():
+        actual, wanted = actual.double(), wanted.double()
+    torch.testing.assert_close(actual, wanted, rtol=within, atol=within, equal_nan=True, check_dtype=False)
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    """Standard normal float64 numbers."""
+    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+
+
+def make_points(n: int, seed: int = 0, *, closed: bool = False) -> Tensor:
+    """(n, 2) points of a scan in beam order: irregular bearings, ranges between 1 and 6 m."""
+    random = torch.rand(2, n, generator=generator(seed), dtype=torch.float64)
+    span = 2 * math.pi if closed else 1.2 * math.pi
+    bearings = -span / 2 + span * (torch.arange(n) + 0.2 + 0.6 * random[0]) / n
+    return polar(1 + 5 * random[1], bearings)
+
+
+def polar(ranges: Tensor, bearings: Tensor) -> Tensor:
+    """(..., 2) Cartesian points."""
+    return ranges[..., None] * torch.stack([bearings.cos(), bearings.sin()], dim=-1)
+
+
+def all_real(points: Tensor) -> Tensor:
+    """(B, N) mask of scans without padding."""
+    return torch.ones(points.shape[:-1], dtype=torch.bool)
+
+
+def pad(points: Tensor, extra: int, value: float = 1e3) -> tuple[Tensor, Tensor]:
+    """(B, N + extra, 2) points, the last `extra` of them rubbish, and their mask."""
+    rubbish = torch.full((len(points), extra, 2), value, dtype=points.dtype)
+    padded = torch.cat([points, rubbish], dim=1)
+    return padded, torch.cat([all_real(points), ~all_real(rubbish)], dim=1)

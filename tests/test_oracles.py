@@ -1,0 +1,142 @@
+"""The oracles against numbers worked out by hand."""
+
+import math
+
+import numpy as np
+import oracles
+import pytest
+
+# Two nodes of two states: scores 00 -> 1+0+2, 01 -> 1+3+0, 10 -> 0+0+2, 11 -> 0-1+0.
+UNARY = np.array([[1.0, 0.0], [2.0, 0.0]])
+PAIRWISE = np.array([[[0.0, 3.0], [0.0, -1.0]]])
+LOG_Z = math.log(math.exp(3) + math.exp(4) + math.exp(2) + math.exp(-1))
+
+CORNER = np.array([[2.0, 0.0], [2.0, 1.0], [1.0, 1.0], [0.0, 1.0]])  # a right angle seen from inside
+
+
+def test_scores_of_all_labellings() -> None:
+    assert [oracles.score(UNARY, PAIRWISE, labels) for labels in oracles.labellings(UNARY)] == [3.0, 4.0, 2.0, -1.0]
+    assert oracles.best_labelling(UNARY, PAIRWISE) == (0, 1)
+
+
+def test_log_partition() -> None:
+    assert oracles.log_partition(UNARY, PAIRWISE) == pytest.approx(LOG_Z)
+    assert oracles.log_partition(UNARY, PAIRWISE, 0) == 4.0
+    halved = 0.5 * math.log(math.exp(6) + math.exp(8) + math.exp(4) + math.exp(-2))
+    assert oracles.log_partition(UNARY, PAIRWISE, 0.5) == pytest.approx(halved)
+
+
+def test_marginals() -> None:
+    first = math.log(math.exp(3) + math.exp(4)) - LOG_Z
+    second = math.log(math.exp(3) + math.exp(2)) - LOG_Z
+    marginals = oracles.log_marginals(UNARY, PAIRWISE)
+    assert marginals[:, 0] == pytest.approx([first, second])
+    assert np.exp(marginals).sum(axis=1) == pytest.approx([1.0, 1.0])
+
+
+def test_max_marginals() -> None:
+    best = oracles.log_marginals(UNARY, PAIRWISE, 0)  # first node 4 and 2, second node 3 and 4
+    assert best[:, 0] - best[:, 1] == pytest.approx([2.0, -1.0])
+
+
+def test_impossible_states() -> None:
+    unary = np.array([[-np.inf, 0.0], [2.0, 0.0]])
+    assert oracles.log_partition(unary, PAIRWISE) == pytest.approx(math.log(math.exp(2) + math.exp(-1)))
+    assert oracles.log_marginals(unary, PAIRWISE)[0].tolist() == pytest.approx([-math.inf, 0.0])
+    assert oracles.log_sum_exp([-math.inf, -math.inf]) == -math.inf
+
+
+def test_motion_and_angle() -> None:
+    assert oracles.move((math.pi / 2, 1.0, 2.0), (3.0, 0.0)) == pytest.approx((1.0, 5.0))
+    assert oracles.wrap(3 * math.pi / 2) == pytest.approx(-math.pi / 2)
+    assert oracles.wrap(-math.pi) == pytest.approx(math.pi)
+    assert oracles.fit_cost((0.0, 1.0, 0.0), np.zeros((2, 2)), np.array([[1.0, 2.0], [0.0, 0.0]]), [1.0, 3.0]) == 4.0 + 3.0
+
+
+def test_robust_square() -> None:
+    assert oracles.robust(0.2, 0.1) == pytest.approx(-4.0)
+    assert oracles.robust(-5.0, 0.1) == -9.0
+
+
+def test_neighbours_clamp_or_wrap() -> None:
+    assert [oracles.neighbour(i, 3, 4, False) for i in range(4)] == [3, 3, 3, 3]
+    assert [oracles.neighbour(i, -3, 4, True) for i in range(4)] == [1, 2, 3, 0]
+
+
+def test_shape_of_a_corner() -> None:
+    assert oracles.distance_to(CORNER, 0, 3, False) == pytest.approx(math.sqrt(5))
+    assert oracles.geodesic_to(CORNER, 0, 3, False) == 3.0
+    assert oracles.geodesic_to(CORNER, 0, 5, False) == 3.0  # clamped at the last point
+    assert oracles.geodesic_to(CORNER, 1, -3, False) == 1.0
+    assert oracles.geodesic_to(CORNER, 3, 1, True) == pytest.approx(math.sqrt(5))  # the last point leads to the first
+    # u = (0, -1), v = (-1, 0): u x v = -1, so three quarters of a turn; from the other side of the wall a quarter
+    assert oracles.angle_between(CORNER, 1, 1, False) == pytest.approx(3 * math.pi / 2)
+    assert oracles.angle_between(CORNER[::-1], 2, 1, False) == pytest.approx(math.pi / 2)
+    assert oracles.angle_between(CORNER, 2, 1, False) == pytest.approx(math.pi)
+    assert oracles.angle_between(CORNER, 0, 1, False) == math.pi  # no arm before the first point
+
+
+def test_local_association() -> None:
+    source, target = CORNER[:2], np.array([[2.0, 0.0], [2.0, 1.5]])
+    out = oracles.local_association(source, target, [1.0] * 12, (0.0, 0.5, 0.0), source + np.array([0.0, 0.25]))
+    assert out.shape == (2, 2, 12)
+    assert out[0, 0, 0] == pytest.approx(-0.125)  # after: 1 - 1.5, before: 0 - 0, the mean of the squares
+    assert out[0, 1, 0] == pytest.approx(-(1.0 + 2.25) / 2)  # after: 1 - 0, before: 0 - 1.5
+    assert out[0, 0, 3:6].tolist() == [0.0, 0.0, 0.0]  # two points: straight everywhere
+    assert np.array_equal(out[..., 0], out[..., 6])
+    assert out[1, 0, 9] == pytest.approx(-((math.sqrt(5) - 2) ** 2))
+    assert out[1, 1, 10] == pytest.approx(-(0.25 + 0.25))  # (2.5, 1) to (2, 1.5)
+    assert out[1, 1, 11] == pytest.approx(-0.0625)  # (2, 1.25) to (2, 1.5)
+
+
+def test_pairwise_association() -> None:
+    source, target = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[0.0, 0.0], [0.0, 2.0]])
+    out = oracles.pairwise_association(source, target, [1.0, 2.0], [-0.5, -0.25])
+    assert out.shape == (1, 3, 3, 4)
+    assert out[0, 0, 1].tolist() == pytest.approx([1, 0, -1, -5 / 4])  # d1 = 1, d2 = 2, |v1 - v2| = sqrt 5
+    assert out[0, 1, 0].tolist() == pytest.approx([0, 0, -1, -5 / 4])
+    assert out[0, 0, 0].tolist() == pytest.approx([0, 0, -1, -1 / 4])
+    assert out[0, 0, 2].tolist() == out[0, 2, 1].tolist() == [0, 1, -0.5, -0.25]
+    assert out[0, 2, 2].tolist() == [0, 0, -0.5, -0.25]
+
+
+# One motion stays, the other goes 1 m to the left; the second point has no association.
+POINTS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+PARTNERS = np.array([[0.0, 1.0], [1.0, 0.5]])
+MOTIONS = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def test_local_clustering() -> None:
+    out = oracles.local_clustering(POINTS, PARTNERS, MOTIONS, [True, False], [0, -1, 1], 1.0, 0.6)
+    assert out.shape == (3, 3, 4)
+    assert out[0].tolist() == [[-1, 0, 1, 0], [0, 0, 1, 0], [0, 1, 0, 0]]  # residuals 1 (active) and 0 (not)
+    assert out[1].tolist() == [[-0.25, 0, 0, 0], [-0.25, 0, 0, 0], [0, 0, 0, 1]]  # the nearest is 0.5 away both times
+    assert out[2].tolist() == [[-0.25, 0, 1, 0], [-2.25, 0, 1, 0], [0, 0, 0, 0]]
+    nobody = oracles.local_clustering(POINTS, PARTNERS, MOTIONS, [False, False], [0, -1, 1], 1.0, 0.6)
+    assert nobody[:, 2, 1].tolist() == [1, 1, 1]
+
+
+def test_pairwise_clustering() -> None:
+    out = oracles.pairwise_clustering(POINTS[[0, 2]], PARTNERS, MOTIONS, [0, 1], 2.0, 1.0)
+    d1, d2 = math.sqrt(2), math.sqrt(1.25)
+    near, stiff = math.exp(-0.5), math.exp(-((d2 - d1) ** 2))
+    assert out.shape == (1, 3, 3, 8)
+    for k in (0, 1):
+        assert out[0, k, k].tolist() == pytest.approx([1, near, 0, stiff, 0, -((d2 - d1) ** 2), 0, 0])
+    assert out[0, 0, 1].tolist() == pytest.approx([0, 0, 1 - near, 0, 1 - stiff, 0, -((math.sqrt(5) - d1) ** 2), 0])
+    assert out[0, 1, 0].tolist() == pytest.approx([0, 0, 1 - near, 0, 1 - stiff, 0, -((1 - d1) ** 2), 0])
+    assert out[0, 2, 2].tolist() == [1] + [0] * 7
+    assert out[0, 2, 0].tolist() == out[0, 1, 2].tolist() == [0] * 7 + [1]
+
+
+def test_pairwise_clustering_needs_both_associations() -> None:
+    out = oracles.pairwise_clustering(POINTS[[0, 2]], PARTNERS, MOTIONS, [0, -1], 2.0, 1.0)
+    assert not out[..., 3:6].any()
+    assert out[0, 0, 0, 1] == pytest.approx(math.exp(-0.5))
+    assert out[0, 1, 0, 6] == pytest.approx(-((1 - math.sqrt(2)) ** 2))
+
+
+def test_stump_sum() -> None:
+    stumps = ([0, 1, 0], [0.5, 2.0, 0.0], [-1.0, 0.25, 3.0], [1.0, -0.25, 5.0])
+    assert oracles.stump_sum([0.5, 2.5], *stumps) == -1.0 - 0.25 + 5.0
+    assert oracles.stump_sum([0.75, 2.0], *stumps) == 1.0 + 0.25 + 5.0

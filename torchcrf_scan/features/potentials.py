@@ -1,0 +1,124 @@
+"""From features to potentials: everything that both chains need to know of a batch, and the modules that were fitted for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.features import association
+from torchcrf_scan.features.boosting import StumpEnsemble
+from torchcrf_scan.features.scales import LOCAL_CHANNELS, STATIC_CHANNELS, Scales
+from torchcrf_scan.features.shape import ShapeDescriptors, describe
+from torchcrf_scan.geometry import se2
+
+OUTLIER_INPUTS = len(LOCAL_CHANNELS) + 2
+
+
+class Boosters(nn.Module):
+    """The two boosted features: `data` scores a pair of points, `outlier` a source point (spec 2.2, 2.3)."""
+
+    def __init__(self, stumps: int = 50) -> None:
+        super().__init__()
+        self.data = StumpEnsemble(len(LOCAL_CHANNELS), stumps)
+        self.outlier = StumpEnsemble(OUTLIER_INPUTS, stumps)
+
+
+@dataclass(frozen=True, slots=True)
+class PairView:
+    """A batch and the descriptors of its scans: what does not depend on motions or candidates."""
+
+    batch: ScanPairBatch
+    source_shape: ShapeDescriptors
+    target_shape: ShapeDescriptors
+
+    @classmethod
+    def of(cls, batch: ScanPairBatch, wrap_closed: bool = True) -> PairView:
+        """wrap_closed: neighbours wrap on a closed scan (A-06); off, they clamp as in the paper."""
+        closed = [flags & wrap_closed for flags in (batch.source_closed, batch.target_closed)]
+        return cls(batch, describe(batch.source, batch.source_mask, closed[0]), describe(batch.target, batch.target_mask, closed[1]))
+
+
+@dataclass(frozen=True, slots=True)
+class AssociationStates:
+    """The inlier states of some source points and what of their features does not depend on the motions.
+
+    Attributes:
+        candidates, mask: (B, N, K) target points and which of them are real.
+        static: (B, N, K, 11) channels L1..L11.
+        static_margin: (B, N, K) data booster over them (spec 2.5.4).
+    """
+
+    candidates: Tensor
+    mask: Tensor
+    static: Tensor
+    static_margin: Tensor
+
+    @classmethod
+    def of(cls, view: PairView, candidates: Tensor, mask: Tensor, scales: Scales, boosters: Boosters) -> AssociationStates:
+        """Gathers the candidates' features. candidates, mask: (B, N, K)."""
+        batch = view.batch
+        shape = association.shape_features(view.source_shape, view.target_shape, candidates, scales)
+        position = association.position_features(batch.source, batch.target, candidates, batch.initial_motion, scales)
+        static = torch.cat([shape, position], dim=-1)
+        return cls(candidates, mask, static, boosters.data.margins(static))
+
+    def nodes(self, part: slice) -> AssociationStates:
+        """The states of a run of source points."""
+        return AssociationStates(self.candidates[:, part], self.mask[:, part], self.static[:, part], self.static_margin[:, part])
+
+
+def registered_points(source_points: Tensor, motions: Tensor, active: Tensor, log_cluster: Tensor) -> Tensor:
+    """(B, N, 2) source points under the best active inlier cluster each (A-12); log_cluster: (B, N, D), the outlier last."""
+    best = log_cluster[..., :-1].masked_fill(~active[:, None], -torch.inf).argmax(-1)  # (B, N)
+    motion = motions.gather(1, best[..., None].expand(-1, -1, 3))  # (B, N, 3)
+    return se2.apply(motion, source_points[:, :, None])[:, :, 0]
+
+
+def association_unary(
+    states: AssociationStates, moved: Tensor, target_points: Tensor, scales: Scales, boosters: Boosters
+) -> Tensor:
+    """The 14 local features of every state: 12 channels, data boosting, outlier boosting; the outlier state last (spec 2.4, 5.1).
+
+    moved: (B, N, 2) source points under their own motion. Returns (B, N, K+1, 14).
+    """
+    registered = association.registered_feature(moved, target_points, states.candidates, scales)[..., None]
+    local = torch.cat([states.static, registered], dim=-1)  # (B, N, K, 12)
+    margin = states.static_margin + boosters.data.margins(registered, first=STATIC_CHANNELS)
+    outlier_margin = boosters.outlier(association.outlier_inputs(local, margin, states.candidates, states.mask))  # (B, N)
+    inliers = torch.cat([local, margin[..., None], torch.zeros_like(margin)[..., None]], dim=-1)
+    B, N = outlier_margin.shape
+    outlier = torch.cat(
+        [scales.local_outlier.expand(B, N, -1), torch.zeros_like(outlier_margin)[..., None], outlier_margin[..., None]], dim=-1
+    )
+    return torch.cat([inliers, outlier[:, :, None]], dim=2)
+
+
+def state_mask(mask: Tensor) -> Tensor:
+    """Adds the outlier state, which is always possible. mask: (B, N, K). Returns (B, N, K+1)."""
+    return torch.cat([mask, mask.new_ones(*mask.shape[:2], 1)], dim=-1)
+
+
+def association_potentials(unary: Tensor, pairwise: Tensor, mask: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Log potentials (B, N, K+1) and (B, N-1, K+1, K+1) of the association chain.
+
+    Args:
+        unary: (B, N, K+1, 14). pairwise: (B, N-1, K+1, K+1, 4). mask: (B, N, K) real candidates. weights: (18,).
+    """
+    log_unary = (unary @ weights[:14]).masked_fill(~state_mask(mask), -torch.inf)
+    return log_unary, pairwise @ weights[14:]
+
+
+def clustering_potentials(local: Tensor, pairwise: Tensor, active: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Log potentials (B, N, D) and (B, N-1, D, D) of the clustering chain; inactive clusters are impossible (spec 7.5).
+
+    Args:
+        local: (B, N, D, 4). pairwise: (B, N-1, D, D, 8). active: (B, D-1). weights: (12,).
+    """
+    possible = torch.cat([active, active.new_ones(len(active), 1)], dim=-1)
+    log_unary = (local @ weights[:4]).masked_fill(~possible[:, None], -torch.inf)
+    return log_unary, pairwise @ weights[4:]
+
+

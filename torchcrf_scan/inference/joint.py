@@ -1,0 +1,245 @@
+"""Algorithm 1 in blocks: exact passes over each chain, motions between them, for a number of rounds (spec 7.2, `sweep`).
+
+    candidates -> clustering chain -> motions -> association chain -> motions -> again, until labels and motions settle
+
+A pair that has settled is frozen, so that it does not matter which other pairs are in its batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchcrf_scan.batch import Prediction
+from torchcrf_scan.config import InferenceConfig, ModelConfig
+from torchcrf_scan.features import candidates as candidate_search
+from torchcrf_scan.features import clustering
+from torchcrf_scan.features.association import pairwise_features
+from torchcrf_scan.features.candidates import Candidates
+from torchcrf_scan.features.potentials import (
+    AssociationStates,
+    Boosters,
+    PairView,
+    association_potentials,
+    association_unary,
+    clustering_potentials,
+    registered_points,
+)
+from torchcrf_scan.features.scales import Scales
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.messages import chain_beliefs
+from torchcrf_scan.inference.motion import Motions, estimate, hard_support, soft_support
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """What was learned: weights (18,) and (12,), the features' scales and boosters."""
+
+    association: Tensor
+    clustering: Tensor
+    scales: Scales
+    boosters: Boosters
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """One round's state of B pairs.
+
+    Attributes:
+        motions: motions and which clusters exist.
+        association: (B, N) hat x_a, target point or -1. cluster: (B, N) hat x_c, cluster or -1.
+        candidates: (B, N, K) inlier states of the association chain, candidate_mask: which are real.
+        log_association: (B, N, K+1), log_cluster: (B, N, D) log-beliefs.
+    """
+
+    motions: Motions
+    association: Tensor
+    cluster: Tensor
+    candidates: Tensor
+    candidate_mask: Tensor
+    log_association: Tensor
+    log_cluster: Tensor
+
+
+def decode(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> Prediction:
+    """Labels and motions of a batch by the sweep schedule; differentiable through beliefs, and through motions where they are soft."""
+    batch, config = view.batch, model.inference
+    state = first_state(view, start, parameters, config)
+    before = older = state
+    converged = torch.zeros(len(batch), dtype=torch.bool, device=batch.source.device)
+    iterations = torch.zeros(len(batch), dtype=torch.int64, device=batch.source.device)
+    for _ in range(config.iterations):
+        after = step(view, start, state, parameters, config, model.chains)
+        if config.stop_early:
+            after = damp(after, state, older)
+            after = keep_settled(after, state, converged)
+        older, before, state = before, state, after
+        iterations = iterations + (~converged).long()
+        converged = converged | has_settled(state, before, config)
+        if config.stop_early and bool(converged.all()):
+            break
+    return read_out(state, converged, iterations)
+
+
+def first_state(view: PairView, start: Start, parameters: Parameters, config: InferenceConfig) -> State:
+    """The start as a state: every point in the cluster whose motion meets a target point nearest."""
+    batch = view.batch
+    found = find_candidates(view, start.motions, start.active, config)
+    at = clustering.correspond(batch.source, batch.target, start.motions, found.nearest, start.association)
+    fit = -at.residual.masked_fill(~start.active[:, None], torch.inf)  # (B, N, C)
+    best = fit.argmax(-1)
+    outlier = start.association < 0
+    log_cluster = torch.cat([fit, torch.full_like(fit[..., :1], -torch.inf)], dim=-1)
+    chosen = (found.index == start.association[..., None]) & found.mask
+    chosen = torch.cat([chosen, ~chosen.any(-1, keepdim=True)], dim=-1)
+    log_association = torch.zeros_like(chosen, dtype=fit.dtype).masked_fill(~chosen, -torch.inf)
+    return State(
+        Motions.start(start.motions, start.active),
+        start.association,
+        best.masked_fill(outlier, -1),
+        found.index,
+        found.mask,
+        log_association,
+        log_cluster,
+    )
+
+
+def find_candidates(view: PairView, motions: Tensor, active: Tensor, config: InferenceConfig) -> Candidates:
+    """The association chain's inlier states under the present motions; `config.candidates` of them, or all (0)."""
+    batch = view.batch
+    return candidate_search.by_motion(batch.source, batch.target, batch.target_mask, motions, active, config.candidates)
+
+
+def step(
+    view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig, chains: str = "joint"
+) -> State:
+    """One round: clustering chain, motions, association chain, motions. A chain that is not in `chains` is left out."""
+    found = find_candidates(view, state.motions.value, state.motions.active, config)
+    if chains != "matching":
+        state = update_clusters(view, state, found, parameters, config)
+        state = update_motions(view, start, state, parameters, config)
+    if chains != "clustering":
+        state = update_association(view, state, found, parameters, config)
+        if chains == "matching":
+            state = inliers_are_background(state)
+        state = update_motions(view, start, state, parameters, config)
+    return state
+
+
+def inliers_are_background(state: State) -> State:
+    """The clusters of CRF-Matching, which has none: every associated point is background, the others are outliers."""
+    log_inlier = state.log_association[..., :-1].logsumexp(-1)
+    log_cluster = torch.stack([log_inlier, state.log_association[..., -1]], dim=-1)
+    return replace(state, cluster=torch.where(state.association >= 0, 0, -1), log_cluster=log_cluster)
+
+
+def update_clusters(view: PairView, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig) -> State:
+    """An exact pass over the clustering chain, motions and associations plugged in."""
+    batch, scales = view.batch, parameters.scales
+    at = clustering.correspond(batch.source, batch.target, state.motions.value, found.nearest, state.association)
+    local = clustering.local_features(at, state.motions.active, scales)
+    pairwise = clustering.pairwise_features(batch.source, at, scales)
+    potentials = clustering_potentials(local, pairwise, state.motions.active, parameters.clustering)
+    log_cluster = chain_beliefs(*potentials, batch.source_mask, config.temperature)
+    return replace(state, log_cluster=log_cluster, cluster=cluster_labels(log_cluster, batch.source_mask))
+
+
+def cluster_labels(log_cluster: Tensor, mask: Tensor) -> Tensor:
+    """(B, N) best cluster, -1 for the outlier and for padding."""
+    best = log_cluster.argmax(-1)
+    return best.masked_fill((best == log_cluster.shape[-1] - 1) | ~mask, -1)
+
+
+def update_association(view: PairView, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig) -> State:
+    """An exact pass over the association chain, every point moved by its cluster's motion."""
+    batch, scales, boosters = view.batch, parameters.scales, parameters.boosters
+    states = AssociationStates.of(view, found.index, found.mask, scales, boosters)
+    moved = registered_points(batch.source, state.motions.value, state.motions.active, state.log_cluster)
+    unary = association_unary(states, moved, batch.target, scales, boosters)
+    pairwise = pairwise_features(batch.source, batch.target, found.index, scales)
+    potentials = association_potentials(unary, pairwise, found.mask, parameters.association)
+    log_association = chain_beliefs(*potentials, batch.source_mask, config.temperature)
+    labels = association_labels(log_association, found.index, batch.source_mask)
+    return replace(
+        state, candidates=found.index, candidate_mask=found.mask, log_association=log_association, association=labels
+    )
+
+
+def association_labels(log_association: Tensor, candidates: Tensor, mask: Tensor) -> Tensor:
+    """(B, N) target point of the best state, -1 for the outlier and for padding."""
+    padded = torch.cat([candidates, torch.full_like(candidates[..., :1], -1)], dim=-1)
+    return padded.gather(-1, log_association.argmax(-1, keepdim=True))[..., 0].masked_fill(~mask, -1)
+
+
+def update_motions(view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig) -> State:
+    """ComputeRT."""
+    batch = view.batch
+    geometry = (batch.source, batch.target, start.target_tangents)
+    support = hard_support(*geometry, state.association, state.cluster, state.motions.value.shape[1])
+    if config.motion_weights == "soft":
+        support = soft_support(*geometry, support, state.candidates, state.log_association, state.log_cluster)
+    scale = parameters.scales.cluster_distance
+    motions = estimate(
+        batch.source, support, state.motions, metric=config.motion_metric, scale=scale, min_extent=config.min_extent
+    )
+    return replace(state, motions=motions)
+
+
+def select_state(chosen: Tensor, yes: State, no: State) -> State:
+    """`yes` for the pairs where chosen (B,) holds, else `no`."""
+
+    def pick(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(chosen.view(-1, *[1] * (a.dim() - 1)), a, b)
+
+    motions = Motions(
+        pick(yes.motions.value, no.motions.value),
+        pick(yes.motions.active, no.motions.active),
+        pick(yes.motions.empty_for, no.motions.empty_for),
+    )
+    names = ("association", "cluster", "candidates", "candidate_mask", "log_association", "log_cluster")
+    return State(motions, *(pick(getattr(yes, name), getattr(no, name)) for name in names))
+
+
+def keep_settled(after: State, before: State, converged: Tensor) -> State:
+    """Pairs that have converged (B,) keep their state."""
+    return select_state(converged, before, after)
+
+
+def same_labels(a: State, b: State) -> Tensor:
+    """(B,) whether both chains' labels agree."""
+    return (a.association == b.association).all(-1) & (a.cluster == b.cluster).all(-1)
+
+
+def damp(after: State, before: State, older: State) -> State:
+    """Halves the motions' step where the labels have come back to those of two rounds ago (the guard of spec 7.6)."""
+    swings = same_labels(after, older) & ~same_labels(after, before)
+    turn = se2.wrap(after.motions.value[..., :1] - before.motions.value[..., :1])
+    half = before.motions.value + torch.cat([turn, after.motions.value[..., 1:] - before.motions.value[..., 1:]], -1) / 2
+    damped = replace(after, motions=replace(after.motions, value=half))
+    return select_state(swings, damped, after)
+
+
+def has_settled(after: State, before: State, config: InferenceConfig) -> Tensor:
+    """(B,) labels unchanged and motions within the tolerances (spec 7.6)."""
+    rotation, translation = se2.distance(after.motions.value.detach(), before.motions.value.detach())
+    still = (rotation < config.rotation_tolerance) & (translation < config.translation_tolerance)
+    still = (still | ~after.motions.active).all(-1)
+    return same_labels(after, before) & still
+
+
+def read_out(state: State, converged: Tensor, iterations: Tensor) -> Prediction:
+    """The state as the user sees it."""
+    return Prediction(
+        association=state.association,
+        cluster=state.cluster,
+        motions=state.motions.value,
+        active=state.motions.active,
+        candidates=state.candidates,
+        log_association=state.log_association,
+        log_cluster=state.log_cluster,
+        converged=converged,
+        iterations=iterations,
+    )

@@ -1,0 +1,189 @@
+"""ComputeRT: the motion of every cluster from the beliefs of both chains (Algorithm 1, lines 10 and 16; spec 7.4, 7.5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcrf_scan.features.shape import gather_points
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.geometry.kabsch import kabsch, safe_atan2
+from torchcrf_scan.inference.registration import gauss_newton_step
+
+ALONG = 0.03  # share of a residual along the surface that a point-to-line step still feels
+PATIENCE = 2  # rounds for which an empty cluster keeps its motion before it is removed
+
+
+@dataclass(frozen=True, slots=True)
+class Motions:
+    """The continuous half of the state.
+
+    Attributes:
+        value: (B, C, 3) motions of background and movers.
+        active: (B, C) bool, clusters that still exist; the background always does.
+        empty_for: (B, C) int64 rounds without a point.
+    """
+
+    value: Tensor
+    active: Tensor
+    empty_for: Tensor
+
+    @classmethod
+    def start(cls, value: Tensor, active: Tensor) -> Motions:
+        """value: (B, C, 3); active: (B, C)."""
+        return cls(value, active, torch.zeros_like(active, dtype=torch.int64))
+
+
+@dataclass(frozen=True, slots=True)
+class Support:
+    """Which point speaks for which cluster, and where it went.
+
+    Attributes:
+        weights: (B, C, N) non-negative.
+        partner: (B, N, 2) where the point went.
+        tangent: (B, N, 2) direction of the surface there.
+        count: (B, C) points labelled so (always by hard labels).
+        spread: (B, C) largest extent of those points, metres (root mean square along their main axis).
+    """
+
+    weights: Tensor
+    partner: Tensor
+    tangent: Tensor
+    count: Tensor
+    spread: Tensor
+
+
+def largest_spread(points: Tensor, weights: Tensor) -> Tensor:
+    """sqrt of the largest eigenvalue of the weighted scatter. points: (B, N, 2); weights: (B, C, N). Returns (B, C)."""
+    total = weights.sum(-1).clamp(min=1)[..., None]
+    mean = weights @ points / total  # (B, C, 2)
+    second = weights @ torch.stack([points[..., 0] ** 2, points[..., 1] ** 2, points[..., 0] * points[..., 1]], -1) / total
+    xx, yy = second[..., 0] - mean[..., 0] ** 2, second[..., 1] - mean[..., 1] ** 2
+    xy = second[..., 2] - mean[..., 0] * mean[..., 1]
+    largest = (xx + yy) / 2 + torch.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+    return largest.clamp(min=0).sqrt()
+
+
+def hard_support(source: Tensor, target: Tensor, tangents: Tensor, association: Tensor, cluster: Tensor, clusters: int) -> Support:
+    """Unit weights on the points with that label and an association: the paper's Eq. 6.
+
+    Args:
+        source: (B, N, 2); target, tangents: (B, M, 2); association, cluster: (B, N), -1 outlier; clusters: C.
+    """
+    of_cluster = cluster[:, None] == torch.arange(clusters, device=cluster.device)[:, None]  # (B, C, N)
+    weights = (of_cluster & (association >= 0)[:, None]).to(source.dtype)
+    index = association.clamp(min=0)
+    with torch.no_grad():
+        spread = largest_spread(source, weights)
+    return Support(weights, gather_points(target, index), gather_points(tangents, index), weights.sum(-1), spread)
+
+
+def soft_support(
+    source: Tensor, target: Tensor, tangents: Tensor, hard: Support, candidates: Tensor, log_association: Tensor, log_cluster: Tensor
+) -> Support:
+    """Beliefs as weights and mean partners (A-18), so that gradients reach the feature weights.
+
+    Args:
+        hard: the support of the labels, whose counts decide what is degenerate.
+        candidates: (B, N, K); log_association: (B, N, K+1); log_cluster: (B, N, D).
+    """
+    inlier = log_association[..., :-1].exp()  # (B, N, K)
+    some = inlier.sum(-1, keepdim=True)
+    share = inlier / some.clamp(min=1e-9)
+    partner = (share[..., None] * gather_points(target, candidates)).sum(-2)
+    tangent = gather_points(tangents, candidates.gather(-1, share.argmax(-1, keepdim=True)))[:, :, 0]
+    real = hard.weights.new_ones(()) * (source.abs().sum(-1) > 0)
+    weights = (log_cluster[..., :-1].exp() * (some * real[..., None])).transpose(1, 2)  # (B, C, N)
+    return Support(weights, partner, tangent, hard.count, hard.spread)
+
+
+def estimate(source: Tensor, support: Support, previous: Motions, *, metric: str, scale: Tensor, min_extent: float) -> Motions:
+    """New motions from the supports, after the rules for small clusters (spec 7.5).
+
+    Three or more points with some extent: a full fit. Fewer: the background's rotation, the points' translation. None: the
+    motion stays for two rounds, then the cluster is removed; the background is never removed.
+
+    Args:
+        source: (B, N, 2). metric: `point` (closed-form Kabsch) or `line` (a robust Gauss-Newton step to the target's surface).
+        scale: () residual at which a robust weight has fallen to a half, metres. min_extent: metres.
+    """
+    points = source[:, None].expand(-1, support.weights.shape[1], -1, -1)  # (B, C, N, 2)
+    partner = support.partner[:, None].expand_as(points)
+    if metric == "point":
+        fitted = kabsch(points, partner, support.weights)
+    else:
+        fitted = line_fit(points, partner, support, previous.value, scale)
+    total = support.weights.sum(-1, keepdim=True)  # (B, C, 1)
+    share = support.weights / total.clamp(min=1e-9)
+    large = (support.count >= 3) & (support.spread >= min_extent)
+    background = torch.where(large[:, :1, None], fitted[:, :1], previous.value[:, :1])
+    theta = background[..., :1].expand_as(fitted[..., :1])
+    shift = (share[..., None] * (partner - se2.rotate(theta, points))).sum(-2)
+    small_fit = torch.cat([theta, shift], dim=-1)
+    value = torch.where(large[..., None], fitted, torch.where((support.count > 0)[..., None], small_fit, previous.value))
+    value = torch.cat([background, value[:, 1:]], dim=1)
+    empty_for = torch.where(support.count > 0, 0, previous.empty_for + 1)
+    active = previous.active & (empty_for < PATIENCE)
+    active = torch.cat([torch.ones_like(active[:, :1]), active[:, 1:]], dim=1)
+    return Motions(torch.where(previous.active[..., None], value, previous.value), active, empty_for)
+
+
+def line_fit(points: Tensor, partner: Tensor, support: Support, start: Tensor, scale: Tensor) -> Tensor:
+    """One robust point-to-line step from `start`. points, partner: (B, C, N, 2); start: (B, C, 3). Returns (B, C, 3)."""
+    moved = se2.apply(start, points)
+    tangent = support.tangent[:, None].expand_as(points)
+    distance = (moved - partner).detach()
+    robust = support.weights / (1 + (distance**2).sum(-1) / scale**2)
+    return se2.compose(gauss_newton_step(moved, partner, tangent, robust, ALONG), start)
+
+
+@dataclass(slots=True)
+class RunningSums:
+    """Sums from which Eq. 6 follows in O(1) when one label changes (spec 7.4); float64, one column a cluster.
+
+    Attributes:
+        value: (B, C, 10): weight, p (2), q (2), p.q, p x q, p_x^2, p_y^2, p_x p_y.
+    """
+
+    value: Tensor
+
+    @staticmethod
+    def terms(p: Tensor, q: Tensor) -> Tensor:
+        """What a pair of points (..., 2) adds: (..., 10)."""
+        p, q = p.double(), q.double()
+        one = torch.ones_like(p[..., :1])
+        dot = (p * q).sum(-1, keepdim=True)
+        cross = p[..., :1] * q[..., 1:] - p[..., 1:] * q[..., :1]
+        return torch.cat([one, p, q, dot, cross, p**2, p[..., :1] * p[..., 1:]], dim=-1)
+
+    @classmethod
+    def of(cls, p: Tensor, q: Tensor, weights: Tensor) -> RunningSums:
+        """p, q: (B, N, 2); weights: (B, C, N)."""
+        return cls(weights.double() @ cls.terms(p, q))
+
+    def change(self, p: Tensor, old_q: Tensor, old: Tensor, new_q: Tensor, new: Tensor) -> None:
+        """One point a pair changes its label or partner. p, old_q, new_q: (B, 2); old, new: (B, C) weights (one-hot or zero)."""
+        self.value = self.value - old[..., None] * self.terms(p, old_q)[:, None] + new[..., None] * self.terms(p, new_q)[:, None]
+
+    def motions(self, previous: Motions, min_extent: float) -> Tensor:
+        """(B, C, 3) motions after the rules of spec 7.5, without removing clusters."""
+        count = self.value[..., 0].round()
+        total = count.clamp(min=1)[..., None]
+        p, q = self.value[..., 1:3] / total, self.value[..., 3:5] / total
+        dot = self.value[..., 5] / total[..., 0] - (p * q).sum(-1)
+        cross = self.value[..., 6] / total[..., 0] - (p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])
+        xx, yy = (self.value[..., 7:9] / total - p**2).unbind(-1)
+        xy = self.value[..., 9] / total[..., 0] - p[..., 0] * p[..., 1]
+        spread = ((xx + yy) / 2 + torch.sqrt(((xx - yy) / 2) ** 2 + xy**2)).clamp(min=0).sqrt()
+        before = previous.value.double()
+        large = (count >= 3) & (spread >= min_extent)
+        theta = safe_atan2(cross, dot)
+        background = torch.where(large[:, :1], theta[:, :1], before[:, :1, 0])
+        theta = torch.where(large, theta, background)
+        shift = q - se2.rotate(theta, p)
+        fitted = torch.cat([theta[..., None], shift], dim=-1)
+        usable = (count > 0) & previous.active
+        usable = torch.cat([large[:, :1], usable[:, 1:]], dim=1)
+        return torch.where(usable[..., None], fitted, before).to(previous.value.dtype)

@@ -1,0 +1,73 @@
+"""The start of the paper configuration (spec 7.3, A-19): the association chain alone, then runs of points that it moved elsewhere."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchcrf_scan.config import InferenceConfig, ModelConfig
+from torchcrf_scan.features.potentials import PairView
+from torchcrf_scan.features.shape import gather_points
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.geometry.kabsch import kabsch
+from torchcrf_scan.inference import joint
+from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.joint import Parameters
+
+INDEX_GAP = 3
+SPATIAL_GAP = 0.75  # metres, as the two below: the paper's car and scanner
+EXPLAINED = 0.3
+FEWEST = 4
+
+
+@torch.no_grad()
+def paper_start(view: PairView, found: Start, parameters: Parameters, config: InferenceConfig) -> Start:
+    """CRF-Matching's motion as background, and up to `clusters` - 2 movers from the runs of its residuals."""
+    batch = view.batch
+    clusters = found.motions.shape[1]
+    begin = Start(batch.initial_motion[:, None], found.active[:, :1], found.association, found.target_tangents)
+    matched = joint.decode(view, begin, parameters, ModelConfig(chains="matching", inference=config))
+    return movers_from_associations(view, matched.motions[:, 0], matched.association, parameters, clusters, found.target_tangents)
+
+
+@torch.no_grad()
+def movers_from_associations(
+    view: PairView, background: Tensor, association: Tensor, parameters: Parameters, clusters: int, tangents: Tensor
+) -> Start:
+    """Steps 2 to 4 of spec 7.3. background: (B, 3); association: (B, N), -1 outlier; clusters: C, background included."""
+    batch = view.batch
+    partner = gather_points(batch.target, association.clamp(min=0))
+    residual = torch.linalg.vector_norm(se2.apply(background, batch.source) - partner, dim=-1)
+    near = torch.maximum(parameters.scales.outlier_threshold, 3 * parameters.scales.cluster_distance)
+    elsewhere = (association >= 0) & (residual > near) & batch.source_mask
+    motions = background[:, None].repeat(1, clusters, 1)
+    active = torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
+    active[:, 0] = True
+    for b in range(len(batch)):
+        index = elsewhere[b].nonzero()[:, 0]
+        found = run_motions(batch.source[b, index], partner[b, index], index)[: clusters - 1]
+        motions[b, 1 : 1 + len(found)], active[b, 1 : 1 + len(found)] = found, True
+    return Start(motions, active, association, tangents)
+
+
+def run_motions(source: Tensor, partner: Tensor, index: Tensor) -> Tensor:
+    """(G, 3) motions of runs of associated points, merged where one explains the other, largest support first.
+
+    Args:
+        source, partner: (P, 2). index: (P,) ascending point numbers; a run ends at a gap in number or in space.
+    """
+    if len(source) < FEWEST:
+        return source.new_zeros(0, 3)
+    apart = (index.diff() > INDEX_GAP) | (torch.linalg.vector_norm(source.diff(dim=0), dim=-1) > SPATIAL_GAP)
+    run = torch.cat([apart.new_zeros(1, dtype=torch.int64), apart.long().cumsum(0)])
+    members = run == torch.arange(int(run[-1]) + 1, device=run.device)[:, None]  # (R, P)
+    members = members[members.sum(-1) >= FEWEST]
+    members = members[members.sum(-1).argsort(descending=True, stable=True)]
+    kept: list[Tensor] = []
+    while len(members):
+        motion = kabsch(source, partner, members[0].to(source))
+        error = torch.linalg.vector_norm(se2.apply(motion, source) - partner, dim=-1)
+        medians = torch.where(members, error, torch.nan).nanmedian(-1).values
+        kept.append(motion)
+        members = members[1:][medians[1:] > EXPLAINED]
+    return torch.stack(kept) if kept else source.new_zeros(0, 3)

@@ -1,0 +1,171 @@
+"""Pseudo-likelihood of an annotation: every label given its neighbours' true labels (spec 6.2).
+
+It needs the features alone, as one tensor a chain: `association_design` and `clustering_design`, rows = nodes, columns = states.
+A conditional logit over them is the objective, convex in the weights; learning builds the designs once and optimises on them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchcrf_scan.batch import ScanPairBatch, Truth
+from torchcrf_scan.config import ModelConfig
+from torchcrf_scan.features import candidates as candidate_search
+from torchcrf_scan.features import clustering
+from torchcrf_scan.features.association import pairwise_features
+from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, association_unary, registered_points, state_mask
+from torchcrf_scan.features.scales import Scales
+from torchcrf_scan.inference.joint import Parameters
+
+
+@dataclass(frozen=True, slots=True)
+class PlugIns:
+    """What the features take as observed while the weights are learned (spec 2.5, 4.1).
+
+    Attributes:
+        motions: (B, C, 3), active: (B, C).
+        association: (B, N) hat x_a in the clustering features, -1 outlier.
+        cluster: (B, N) hat x_c in the registered channel, -1 outlier (moved with the background).
+        label: (B, N) true cluster as a slot of `motions`, -1 outlier.
+        known: (B, N) bool, nodes whose labels count.
+    """
+
+    motions: Tensor
+    active: Tensor
+    association: Tensor
+    cluster: Tensor
+    label: Tensor
+    known: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """A chain's features at the true labels of the neighbours.
+
+    Attributes:
+        features: (B, N, S, W). mask: (B, N, S) possible states. label: (B, N) true state. known: (B, N) nodes that count.
+    """
+
+    features: Tensor
+    mask: Tensor
+    label: Tensor
+    known: Tensor
+
+    def log_likelihood(self, weights: Tensor) -> Tensor:
+        """(B, N) log p(true state | neighbours, observation); 0 where nobody knows. weights: (W,)."""
+        score = (self.features @ weights).masked_fill(~self.mask, -torch.inf)
+        chosen = torch.log_softmax(score, dim=-1).gather(-1, self.label[..., None])[..., 0]
+        return torch.where(self.known, chosen, torch.zeros_like(chosen))
+
+
+def true_plugins(batch: ScanPairBatch, clusters: int) -> PlugIns:
+    """Everything at the truth (the faithful reading, A-11); movers beyond the `clusters` slots are unknown."""
+    truth = _truth_of(batch)
+    B, G = truth.motions.shape[:2]
+    slots = min(G, clusters)
+    given = truth.motions[:, :slots].isfinite().all(-1)
+    motions = torch.zeros(B, clusters, 3, dtype=truth.motions.dtype, device=truth.motions.device)
+    motions[:, :slots] = truth.motions[:, :slots].nan_to_num()
+    active = torch.zeros(B, clusters, dtype=torch.bool, device=motions.device)
+    active[:, :slots] = given
+    active[:, 0] = True
+    covered = active.gather(1, truth.cluster.clamp(0, clusters - 1)) & (truth.cluster < clusters)
+    known = truth.known & (covered | (truth.cluster < 0))
+    label = truth.cluster.masked_fill(~known, -1)
+    return PlugIns(motions, active, truth.association, label, label, known)
+
+
+def _truth_of(batch: ScanPairBatch) -> Truth:
+    assert batch.truth is not None
+    return batch.truth
+
+
+def with_truth(index: Tensor, mask: Tensor, association: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Adds every true target to the candidates, in place of the last, and finds it there.
+
+    Args:
+        index, mask: (B, N, K). association: (B, N), -1 outlier.
+
+    Returns:
+        index, mask, and (B, N) the state of the truth, K for an outlier.
+    """
+    K = index.shape[-1]
+    is_inlier = association >= 0
+    there = (index == association[..., None]) & mask
+    missing = is_inlier & ~there.any(-1)
+    last = torch.arange(K, device=index.device) == K - 1
+    put = missing[..., None] & last
+    index = torch.where(put, association[..., None], index)
+    mask = mask | put
+    place = ((index == association[..., None]) & mask).int().argmax(-1)
+    return index, mask, torch.where(is_inlier, place, K)
+
+
+def association_design(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, count: int) -> Design:
+    """The association chain's 18 features of every state; `count` candidates and the truth, or every target (0)."""
+    batch = view.batch
+    truth = _truth_of(batch)
+    found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, count)
+    index, mask, label = with_truth(found.index, found.mask, truth.association)
+    states = AssociationStates.of(view, index, mask, scales, boosters)
+    C = plugins.motions.shape[1]
+    one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), C + 1).to(batch.source.dtype)
+    moved = registered_points(batch.source, plugins.motions, plugins.active, one_hot)
+    unary = association_unary(states, moved, batch.target, scales, boosters)
+    pairwise = pairwise_features(batch.source, batch.target, index, scales)
+    known = truth.known & batch.source_mask
+    features = torch.cat([unary, at_true_neighbours(pairwise, label, known)], dim=-1)
+    return Design(features, state_mask(mask), label, known)
+
+
+def clustering_design(view: PairView, plugins: PlugIns, scales: Scales) -> Design:
+    """The clustering chain's 12 features of every state."""
+    batch = view.batch
+    C = plugins.motions.shape[1]
+    found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, 1)
+    at = clustering.correspond(batch.source, batch.target, plugins.motions, found.nearest, plugins.association)
+    local = clustering.local_features(at, plugins.active, scales)
+    pairwise = clustering.pairwise_features(batch.source, at, scales)
+    label = torch.where(plugins.label >= 0, plugins.label, C)
+    known = plugins.known & batch.source_mask
+    features = torch.cat([local, at_true_neighbours(pairwise, label, known)], dim=-1)
+    possible = torch.cat([plugins.active, plugins.active.new_ones(len(label), 1)], dim=-1)
+    return Design(features, possible[:, None].expand(features.shape[:3]), label, known)
+
+
+def at_true_neighbours(pairwise: Tensor, label: Tensor, known: Tensor) -> Tensor:
+    """Sum of a node's two edges' features with the neighbours at their true states; nothing where a neighbour is unknown.
+
+    Args:
+        pairwise: (B, N-1, S, S, P). label: (B, N) states. known: (B, N).
+
+    Returns:
+        (B, N, S, P).
+    """
+    B, E, S, _, P = pairwise.shape
+    row = label[:, :-1, None, None, None].expand(B, E, 1, S, P)
+    column = label[:, 1:, None, None, None].expand(B, E, S, 1, P)
+    from_before = pairwise.gather(2, row)[:, :, 0] * known[:, :-1, None, None]  # (B, E, S, P) for node i + 1
+    from_after = pairwise.gather(3, column)[:, :, :, 0] * known[:, 1:, None, None]  # for node i
+    none = pairwise.new_zeros(B, 1, S, P)
+    return torch.cat([none, from_before], dim=1) + torch.cat([from_after, none], dim=1)
+
+
+def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Parameters, config: ModelConfig) -> Tensor:
+    """(B,) sum over nodes and chains (one chain alone where the model has one)."""
+    total = view.batch.source.new_zeros(len(view.batch))
+    if config.chains != "clustering":
+        count = config.inference.candidates
+        design = association_design(view, plugins, parameters.scales, parameters.boosters, count)
+        total = total + design.log_likelihood(parameters.association).sum(-1)
+    if config.chains != "matching":
+        total = total + clustering_design(view, plugins, parameters.scales).log_likelihood(parameters.clustering).sum(-1)
+    return total
+
+
+def for_background_alone(plugins: PlugIns) -> PlugIns:
+    """Every point moves with the background: the plug-ins of CRF-Matching."""
+    return replace(plugins, motions=plugins.motions[:, :1], active=plugins.active[:, :1], cluster=torch.zeros_like(plugins.cluster))

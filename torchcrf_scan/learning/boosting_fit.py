@@ -1,0 +1,158 @@
+"""AdaBoost over decision stumps, fitted by scikit-learn, handed over as tables (spec 2.2, 2.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcrf_scan.features import association
+from torchcrf_scan.features import candidates as candidate_search
+from torchcrf_scan.features.boosting import StumpEnsemble
+from torchcrf_scan.features.candidates import squared_distances
+from torchcrf_scan.features.potentials import OUTLIER_INPUTS, AssociationStates, Boosters, PairView
+from torchcrf_scan.features.scales import LOCAL_CHANNELS, STATIC_CHANNELS, Scales
+from torchcrf_scan.inference.pseudo_likelihood import PlugIns
+from torchcrf_scan.learning.scales_fit import own_motion
+
+NEAREST = 15
+
+
+def fit_stumps(inputs: np.ndarray, positive: np.ndarray, stumps: int) -> StumpEnsemble:
+    """Discrete AdaBoost on class-balanced examples.
+
+    Args:
+        inputs: (P, F) float32. positive: (P,) bool. stumps: at most; fewer where a split is perfect.
+
+    Returns:
+        The ensemble, H = decision_function * sum of estimator weights / 4 (scikit-learn's weights are twice AdaBoost's alpha and
+        its decision function is 2 H over their sum); the zero ensemble where one class is missing.
+    """
+    from sklearn.ensemble import AdaBoostClassifier
+    from sklearn.tree import DecisionTreeClassifier
+
+    ensemble = StumpEnsemble(inputs.shape[1], stumps)
+    if positive.all() or not positive.any():
+        return ensemble
+    balance = np.where(positive, 0.5 / positive.sum(), 0.5 / (~positive).sum())
+    fitted = AdaBoostClassifier(DecisionTreeClassifier(max_depth=1), n_estimators=stumps, random_state=0)
+    fitted.fit(inputs, positive, sample_weight=balance)
+    alphas = np.minimum(fitted.estimator_weights_, 2 * np.log(1e6)) / 2  # a perfect stump's weight is capped (spec 2.2)
+    rows = [stump_of(tree.tree_) for tree in fitted.estimators_]
+    feature, threshold, left, right = (torch.tensor(column) for column in zip(*rows, strict=True))
+    alpha = torch.from_numpy(alphas[: len(rows)])
+    ensemble.set_stumps(feature, threshold, left * alpha, right * alpha)
+    return ensemble
+
+
+def stump_of(tree: object) -> tuple[int, float, float, float]:
+    """(feature, threshold, left sign, right sign); a tree that did not split says the same on both sides.
+
+    The threshold is rounded down to float32, which decides float32 inputs just as the float64 one does.
+    """
+    sign = np.where(tree.value[:, 0, 1] > tree.value[:, 0, 0], 1.0, -1.0)  # type: ignore[attr-defined]
+    if tree.node_count == 1:  # type: ignore[attr-defined]
+        return 0, 0.0, float(sign[0]), float(sign[0])
+    exact = tree.threshold[0]  # type: ignore[attr-defined]
+    rounded = np.float32(exact)
+    if rounded > exact:
+        rounded = np.nextafter(rounded, np.float32(-np.inf))
+    left, right = tree.children_left[0], tree.children_right[0]  # type: ignore[attr-defined]
+    return int(tree.feature[0]), float(rounded), float(sign[left]), float(sign[right])  # type: ignore[attr-defined]
+
+
+def data_examples(
+    view: PairView, plugins: PlugIns, scales: Scales, negatives: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Pairs of points: the true one of every inlier, and wrong ones: half uniform, a third near in space, the rest near in index.
+
+    Returns:
+        (P, 12) local channels and (P,) bool.
+    """
+    batch = view.batch
+    assert batch.truth is not None
+    truth = batch.truth.association
+    moved = own_motion(plugins, batch.source)
+    index, is_usable = sample_targets(truth, moved, batch.target, batch.target_mask, negatives, generator)
+    index = torch.cat([truth.clamp(min=0)[..., None], index], dim=-1)  # the true one first
+    is_usable = torch.cat([(truth >= 0)[..., None], is_usable], dim=-1)
+    states = AssociationStates.of(view, index, is_usable, scales, Boosters(1))
+    registered = association.registered_feature(moved, batch.target, index, scales)
+    channels = torch.cat([states.static, registered[..., None]], dim=-1)  # (B, N, 1 + negatives, 12)
+    chosen = is_usable & (plugins.known & batch.truth.known & batch.source_mask)[..., None]
+    positive = torch.zeros_like(chosen)
+    positive[..., 0] = True
+    return channels[chosen], positive[chosen]
+
+
+def sample_targets(
+    truth: Tensor, moved: Tensor, target: Tensor, target_mask: Tensor, count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Wrong targets (B, N, count) and which of them may be used: never the true one or, as annotators err by one, its neighbour."""
+    B, N = truth.shape
+    M = target.shape[1]
+    near_index = max(1, count // 5) if count > 1 else 0
+    near_space = round(0.3 * count)
+    uniform = count - near_index - near_space
+
+    def draw(high: int, many: int) -> Tensor:
+        return torch.randint(high, (B, N, many), generator=generator).to(truth.device)
+
+    length = target_mask.sum(-1)[:, None, None]
+    anywhere = draw(M, uniform) % length.clamp(min=1)
+    nearest = squared_distances(moved, target, target_mask).topk(min(NEAREST, M), largest=False).indices  # (B, N, 15)
+    close = nearest.gather(-1, draw(nearest.shape[-1], near_space))
+    step = (2 + draw(9, near_index)) * (1 - 2 * draw(2, near_index))
+    beside = truth.clamp(min=0)[..., None] + step
+    index = torch.cat([anywhere, close, beside], dim=-1)
+    inside = (index >= 0) & (index < length)
+    wrong = (index - truth[..., None]).abs() > 1
+    return index.clamp(0, M - 1), inside & (wrong | (truth < 0)[..., None])
+
+
+def outlier_examples(
+    view: PairView, plugins: PlugIns, scales: Scales, data_booster: StumpEnsemble, count: int
+) -> tuple[Tensor, Tensor]:
+    """Source points: (P, 14) inputs reduced over the `count` candidates (0: all), and (P,) whether the truth is an outlier."""
+    batch = view.batch
+    assert batch.truth is not None
+    found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, count)
+    boosters = Boosters(data_booster.thresholds.shape[1])
+    boosters.data = data_booster
+    states = AssociationStates.of(view, found.index, found.mask, scales, boosters)
+    registered = association.registered_feature(own_motion(plugins, batch.source), batch.target, found.index, scales)[..., None]
+    local = torch.cat([states.static, registered], dim=-1)
+    margin = states.static_margin + data_booster.margins(registered, first=STATIC_CHANNELS)
+    inputs = association.outlier_inputs(local, margin, found.index, found.mask)
+    known = batch.truth.known & batch.source_mask & plugins.known
+    return inputs[known], (batch.truth.association < 0)[known]
+
+
+def fit_boosters(
+    views: Sequence[PairView],
+    plugins: Sequence[PlugIns],
+    scales: Scales,
+    *,
+    stumps: int,
+    negatives: int,
+    candidates: int,
+    generator: torch.Generator,
+) -> Boosters:
+    """Data booster, then the outlier booster on its margins."""
+    boosters = Boosters(stumps)
+    boosters.data = fit_stumps(
+        *_stack([data_examples(v, p, scales, negatives, generator) for v, p in zip(views, plugins, strict=True)]), stumps
+    )
+    boosters.outlier = fit_stumps(
+        *_stack([outlier_examples(v, p, scales, boosters.data, candidates) for v, p in zip(views, plugins, strict=True)]), stumps
+    )
+    assert len(boosters.data.thresholds) == len(LOCAL_CHANNELS)
+    assert len(boosters.outlier.thresholds) == OUTLIER_INPUTS
+    return boosters
+
+
+def _stack(parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[np.ndarray, np.ndarray]:
+    inputs = torch.cat([part[0] for part in parts]).float().cpu().numpy()
+    return inputs, torch.cat([part[1] for part in parts]).cpu().numpy()

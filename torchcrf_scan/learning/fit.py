@@ -1,0 +1,181 @@
+"""Learning a model from annotated pairs, stage by stage: start, scales, boosters, association weights, clustering weights.
+
+Everything that is fitted is fitted on the given pairs alone, so a fold of a cross-validation is one call.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.config import LearningConfig
+from torchcrf_scan.features.potentials import Boosters, PairView
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS
+from torchcrf_scan.inference import joint, pseudo_likelihood
+from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.motion import Motions
+from torchcrf_scan.inference.pseudo_likelihood import Design, PlugIns
+from torchcrf_scan.learning.boosting_fit import fit_boosters
+from torchcrf_scan.learning.hypothesis_fit import fit_hypothesis_score
+from torchcrf_scan.learning.plugins import mix_associations, training_plugins
+from torchcrf_scan.learning.scales_fit import fit_scales
+from torchcrf_scan.learning.weights_fit import Watch, fit_weights, flatten
+from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.scan import ScanPair
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Lesson:
+    """A batch of training pairs with all that is taken as observed; `fold` is its part of the out-of-fold margins."""
+
+    view: PairView
+    start: Start
+    plugins: PlugIns
+    fold: int
+
+
+def fit(model: JointScanCRF, pairs: Sequence[ScanPair], config: LearningConfig, watch: dict[str, Watch] | None = None) -> None:
+    """Fits everything that `model` learns, in place.
+
+    Args:
+        pairs: annotated pairs; raises ValueError where one is not.
+        watch: callbacks of the two weight fits, by chain: `association`, `clustering`.
+    """
+    bare = [pair.name for pair in pairs if pair.annotation is None]
+    if bare or not pairs:
+        raise ValueError(f"pairs: expected annotated pairs, got {bare[:3] or 'none'}")
+    watch = watch or {}
+    generator = torch.Generator().manual_seed(config.seed)
+    chains = model.config.chains
+    model.hypothesis_score = fit_hypothesis_score(pairs, seed=config.seed)
+    lessons = prepare(model, pairs, config, generator)
+    views, plugins = [lesson.view for lesson in lessons], [lesson.plugins for lesson in lessons]
+    model.scales.load_state_dict(fit_scales(views, plugins).state_dict())
+    if chains != "clustering":
+        margins = fit_all_boosters(model, lessons, config, generator)
+        log.info("association weights")
+        designs = [association_design(model, lesson, margins[lesson.fold]) for lesson in lessons]
+        set_weights(model, "association", fit_weights(flatten(designs, live_weights(model)), config, watch.get("association")))
+    if chains != "matching":
+        if chains == "joint":
+            predicted = [predict_association(model, lesson, margins[lesson.fold]) for lesson in lessons]
+        else:
+            predicted = [lesson.start.association for lesson in lessons]
+        log.info("clustering weights")
+        clustering = [cluster_design(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True)]
+        set_weights(model, "clustering", fit_weights(flatten(clustering, torch.ones(12)), config, watch.get("clustering")))
+
+
+def prepare(
+    model: JointScanCRF, pairs: Sequence[ScanPair], config: LearningConfig, generator: torch.Generator
+) -> list[Lesson]:
+    """Batches of one fold each, their starts and training plug-ins."""
+    lessons = []
+    folds = assign_folds(pairs, config.folds)
+    batches = [
+        (fold, part[k : k + config.batch_size])
+        for fold in sorted(set(folds))
+        for part in [[pair for pair, f in zip(pairs, folds, strict=True) if f == fold]]
+        for k in range(0, len(part), config.batch_size)
+    ]
+    for fold, part in tqdm(batches, desc="start", unit="batch", leave=False):
+        batch = ScanPairBatch.collate(part)
+        start = model.initialise(batch)
+        plugins = training_plugins(batch, start, config, generator)
+        if model.config.chains == "matching":
+            plugins = pseudo_likelihood.for_background_alone(plugins)
+        lessons.append(Lesson(model.view(batch), start, plugins, fold))
+    return lessons
+
+
+def assign_folds(pairs: Sequence[ScanPair], folds: int) -> list[int]:
+    """A fold for every pair; sequences stay whole and are dealt out in turn by size. One fold where there is nothing to deal."""
+    sizes: dict[str, int] = {}
+    for pair in pairs:
+        sizes[pair.sequence] = sizes.get(pair.sequence, 0) + 1
+    load = [0] * max(1, min(folds, len(sizes)))
+    fold_of = {}
+    for sequence in sorted(sizes, key=lambda name: (-sizes[name], name)):
+        fold_of[sequence] = load.index(min(load))
+        load[fold_of[sequence]] += sizes[sequence]
+    return [fold_of[pair.sequence] for pair in pairs]
+
+
+def fit_all_boosters(
+    model: JointScanCRF, lessons: Sequence[Lesson], config: LearningConfig, generator: torch.Generator
+) -> dict[int, Boosters]:
+    """The model's boosters, fitted on all pairs, and by fold those fitted on the other folds (margins of unseen pairs, spec 2.5)."""
+
+    def fit_on(part: Sequence[Lesson]) -> Boosters:
+        return fit_boosters(
+            [lesson.view for lesson in part],
+            [lesson.plugins for lesson in part],
+            model.scales,
+            stumps=model.config.features.stumps,
+            negatives=config.negatives,
+            candidates=model.config.inference.candidates,
+            generator=generator,
+        )
+
+    numbers = sorted({lesson.fold for lesson in lessons})
+    jobs = {number: [lesson for lesson in lessons if lesson.fold != number] for number in numbers}
+    everything = fit_on(lessons)
+    model.boosters.load_state_dict(everything.state_dict())
+    if len(numbers) == 1:
+        return {numbers[0]: everything}
+    return {number: fit_on(part) for number, part in tqdm(jobs.items(), desc="boosters", unit="fold", leave=False)}
+
+
+def association_design(model: JointScanCRF, lesson: Lesson, margins: Boosters) -> Design:
+    """The lesson's association features with margins of boosters that have not seen it."""
+    count = model.config.inference.candidates
+    return pseudo_likelihood.association_design(lesson.view, lesson.plugins, model.scales, margins, count)
+
+
+def predict_association(model: JointScanCRF, lesson: Lesson, margins: Boosters) -> Tensor:
+    """(B, N) labels of one exact pass over the association chain at the training motions."""
+    parameters = replace(model.fitted, boosters=margins)
+    plugins, config = lesson.plugins, model.config.inference
+    with torch.no_grad():
+        start = Start(plugins.motions, plugins.active, lesson.start.association, lesson.start.target_tangents)
+        state = joint.first_state(lesson.view, start, parameters, config)
+        one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), config.clusters).to(plugins.motions)
+        state = replace(state, motions=Motions.start(plugins.motions, plugins.active), log_cluster=one_hot)
+        found = joint.find_candidates(lesson.view, plugins.motions, plugins.active, config)
+        return joint.update_association(lesson.view, state, found, parameters, config).association
+
+
+def cluster_design(
+    model: JointScanCRF, lesson: Lesson, predicted: Tensor, config: LearningConfig, generator: torch.Generator
+) -> Design:
+    """The lesson's clustering features, with predicted associations for some pairs; for all where the chain stands alone (A-28)."""
+    share = config.predicted_share if model.config.chains == "joint" else 1.0
+    plugins = mix_associations(lesson.plugins, predicted, share, generator)
+    return pseudo_likelihood.clustering_design(lesson.view, plugins, model.scales)
+
+
+def live_weights(model: JointScanCRF) -> Tensor:
+    """(18,) 1 for the association weights that are learned; 0 for the raw channels in W-B."""
+    live = torch.ones(len(ASSOCIATION_WEIGHTS), dtype=torch.float64)
+    if not model.config.features.raw_channels:
+        live[: len(LOCAL_CHANNELS)] = 0
+    return live
+
+
+@torch.no_grad()
+def set_weights(model: JointScanCRF, chain: str, values: Tensor) -> None:
+    """Writes (18,) or (12,) weights into the named parameters."""
+    names, weights = {
+        "association": (ASSOCIATION_WEIGHTS, model.association_weights),
+        "clustering": (CLUSTERING_WEIGHTS, model.clustering_weights),
+    }[chain]
+    for name, value in zip(names, values, strict=True):
+        weights[name].copy_(value)

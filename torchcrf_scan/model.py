@@ -1,0 +1,207 @@
+"""The layer: a conditional random field over two scans (van de Ven, Ramos, Tipaldi, ICRA 2010)."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.features.potentials import Boosters, PairView
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS, Scales
+from torchcrf_scan.inference import flooding, joint, pseudo_likelihood
+from torchcrf_scan.inference.initialise import Start, initialise
+from torchcrf_scan.inference.joint import Parameters
+from torchcrf_scan.inference.movers import HypothesisScore
+from torchcrf_scan.inference.paper_start import paper_start
+from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
+
+PRETRAINED = "simulated"
+
+
+class JointScanCRF(nn.Module):
+    """Joint association, clustering and motion of B scan pairs.
+
+    Thirty named weights, 18 of the association chain and 12 of the clustering chain (spec 5.1); the boosters, the features'
+    scales and the score of the start's hypotheses are buffers, fitted before the weights (`torchcrf_scan.learning`).
+
+    Gradients reach the weights and the points through log-beliefs and, with `inference.motion_weights = soft`, through the motions,
+    at fixed candidates and away from kinks (ties, capped errors). Without gradient: the labels, the start, the choice of
+    candidates, and the boosted scores, which are steps.
+    """
+
+    association_weights: nn.ParameterDict
+    clustering_weights: nn.ParameterDict
+
+    def __init__(self, config: ModelConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or ModelConfig()
+        self.association_weights = nn.ParameterDict({name: torch.zeros(()) for name in ASSOCIATION_WEIGHTS})
+        self.clustering_weights = nn.ParameterDict({name: torch.zeros(()) for name in CLUSTERING_WEIGHTS})
+        self.scales = Scales()
+        self.boosters = Boosters(self.config.features.stumps)
+        self.hypothesis_score = HypothesisScore()
+        self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Weights that decode something sensible before any learning: near in motion, in sequence, alike in shape."""
+        for weight in self.parameters():
+            weight.zero_()
+        start = {"registered_translation": 1.0, "sequence": 2.0, "pairwise_distance": 0.3, "pairwise_outlier": -1.0}
+        for name, value in start.items():
+            self.association_weights[name].fill_(value)
+        start = {"cluster_distance": 1.0, "outlier": 2.0, "cluster_inlier_in": 1.0, "sequence": 2.0, "pairwise_outlier": -1.0}
+        for name, value in start.items():
+            self.clustering_weights[name].fill_(value)
+
+    def extra_repr(self) -> str:
+        """The settings that decide the shapes."""
+        c = self.config.inference
+        return f"chains={self.config.chains}, clusters={c.clusters}, candidates={c.candidates or 'dense'}, schedule={c.schedule}"
+
+    @property
+    def weight_vectors(self) -> tuple[Tensor, Tensor]:
+        """(18,) and (12,): the weights in the order of `ASSOCIATION_WEIGHTS` and `CLUSTERING_WEIGHTS`, raw channels off in W-B."""
+        association = torch.stack([self.association_weights[name] for name in ASSOCIATION_WEIGHTS])
+        if not self.config.features.raw_channels:
+            live = torch.arange(len(association), device=association.device) >= len(LOCAL_CHANNELS)
+            association = association * live
+        return association, torch.stack([self.clustering_weights[name] for name in CLUSTERING_WEIGHTS])
+
+    @property
+    def fitted(self) -> Parameters:
+        """All that was learned, as the inference functions take it."""
+        return Parameters(*self.weight_vectors, self.scales, self.boosters)
+
+    def view(self, batch: ScanPairBatch) -> PairView:
+        """What the features need of a batch, computed once."""
+        return PairView.of(batch, self.config.features.wrap_closed)
+
+    def initialise(self, batch: ScanPairBatch) -> Start:
+        """InitialiseRT: the motions to begin with (Algorithm 1, line 1). No gradient."""
+        clusters = self.config.inference.clusters - 1
+        if self.config.chains == "matching":
+            clusters = 1
+        found = initialise(batch, self.scales, self.hypothesis_score, clusters)
+        if self.config.start == "search":
+            return found
+        return paper_start(self.view(batch), found, self.fitted, self.config.inference)
+
+    def forward(self, batch: ScanPairBatch, start: Start | None = None) -> Prediction:
+        """Labels, motions and log-beliefs of every pair.
+
+        Args:
+            batch: B pairs.
+            start: motions to begin with; looked for where absent. For `ClusteringCRF` its association is the fixed one.
+        """
+        start = start or self.initialise(batch)
+        view = self.view(batch)
+        if self.config.inference.schedule == "flooding":
+            return flooding.decode(view, start, self.fitted, self.config)
+        return joint.decode(view, start, self.fitted, self.config)
+
+    def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
+        """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.
+
+        plugins: motions and labels taken as observed in the features; the true ones where absent.
+        """
+        if batch.truth is None:
+            raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
+        view = self.view(batch)
+        plugins = plugins or pseudo_likelihood.true_plugins(batch, self.config.inference.clusters - 1)
+        return pseudo_likelihood.pseudo_log_likelihood(view, plugins, self.fitted, self.config)
+
+    @torch.no_grad()
+    def match(self, source: Scan, target: Scan, dt: float = 0.1) -> PairPrediction:
+        """One pair, by beam: what became of every beam of `source`, which move together, and how."""
+        pair = ScanPair(source, target, dt)
+        return self.match_pairs([pair])[0]
+
+    @torch.no_grad()
+    def match_pairs(self, pairs: Sequence[ScanPair], batch_size: int = 16) -> list[PairPrediction]:
+        """Many pairs, in batches."""
+        reference = self.association_weights["sequence"]
+        found = []
+        for begin in range(0, len(pairs), batch_size):
+            part = pairs[begin : begin + batch_size]
+            batch = ScanPairBatch.collate(part, reference.dtype).without_truth().to(reference.device)
+            prediction = self(batch)
+            found += [prediction.pair(b, pair) for b, pair in enumerate(part)]
+        return found
+
+    def save_pretrained(self, folder: str | Path) -> None:
+        """Writes `config.json` and `model.safetensors` into a folder, each whole or not at all."""
+        from safetensors.torch import save
+
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        contents = {
+            "config.json": (json.dumps(asdict(self.config), indent=2) + "\n").encode(),
+            "model.safetensors": save({name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}),
+        }
+        for name, content in contents.items():
+            temporary = folder / f".{name}.{os.getpid()}"
+            temporary.write_bytes(content)
+            os.replace(temporary, folder / name)
+
+    @classmethod
+    def from_pretrained(cls, name_or_path: str | Path = PRETRAINED, **inference: Any) -> JointScanCRF:
+        """A model from a folder written by `save_pretrained`, or one that the package ships, by name.
+
+        Args:
+            name_or_path: a folder, or a name under `torchcrf_scan/weights`.
+            inference: fields of `InferenceConfig` to change, e.g. `candidates=0`.
+        """
+        from safetensors.torch import load
+
+        folder = find_weights(name_or_path)
+        config = model_config(json.loads((folder / "config.json").read_text()))
+        if inference:
+            config = replace(config, inference=replace(config.inference, **inference))
+        model = cls(config)
+        model.load_state_dict(load((folder / "model.safetensors").read_bytes()))
+        return model.eval()
+
+
+class MatchingCRF(JointScanCRF):
+    """The association chain alone, 18 weights, one motion for the whole scan (A-25): CRF-Matching."""
+
+    def __init__(self, config: ModelConfig | None = None) -> None:
+        super().__init__(replace(config or ModelConfig(), chains="matching"))
+
+
+class ClusteringCRF(JointScanCRF):
+    """The clustering chain alone, 12 weights, on associations that come with the start and stay: CRF-Clustering."""
+
+    def __init__(self, config: ModelConfig | None = None) -> None:
+        super().__init__(replace(config or ModelConfig(), chains="clustering"))
+
+
+def model_config(values: dict[str, Any]) -> ModelConfig:
+    """The config that `asdict` made into a dictionary."""
+    return ModelConfig(
+        **{k: v for k, v in values.items() if k not in ("features", "inference")},
+        features=FeatureConfig(**values["features"]),
+        inference=InferenceConfig(**values["inference"]),
+    )
+
+
+def find_weights(name_or_path: str | Path) -> Path:
+    """The folder of a saved model: a path, or the name of one that the package ships."""
+    path = Path(name_or_path)
+    if (path / "config.json").is_file():
+        return path
+    shipped = Path(str(files("torchcrf_scan") / "weights"))
+    if (shipped / str(name_or_path) / "config.json").is_file():
+        return shipped / str(name_or_path)
+    names = sorted(entry.name for entry in shipped.iterdir()) if shipped.is_dir() else []
+    raise ValueError(f"name_or_path: expected a folder with config.json or one of {', '.join(names) or 'no'} shipped models, got {path}")
