@@ -12,10 +12,9 @@ TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-9}  # relative and absolute
 def assert_close(actual: Tensor, expected: Any, *, tolerance: float | None = None) -> None:
     """Same shape, same infinities and NaN, and values within the tolerance of `actual`'s dtype (exact for whole numbers)."""
     within = TOLERANCE.get(actual.dtype, 0.0) if tolerance is None else tolerance
-    wanted = torch.as_tensor(expected)
-    if actual.is_floating_point():
-        actual, wanted = actual.double(), wanted.double()
-    torch.testing.assert_close(actual, wanted, rtol=within, atol=within, equal_nan=True, check_dtype=False)
+    comparable = actual.double() if actual.is_floating_point() else actual
+    wanted = torch.as_tensor(expected, dtype=comparable.dtype)
+    torch.testing.assert_close(comparable, wanted, rtol=within, atol=within, equal_nan=True)
 
 
 def generator(seed: int) -> torch.Generator:

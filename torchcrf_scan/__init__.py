@@ -1,3 +1,30 @@
-"""torchcrf_scan."""
+"""Which laser point became which, which points move together, and how: a conditional random field over two planar scans.
+
+Dimensions: B pairs, N source points, M target points, K candidates per point, S = K+1 association states (last = outlier),
+D clusters (0 background, 1..D-2 movers, last = outlier; files write the outlier as -1), F features, E edges. Batch first; masks
+are bool, True = real; logarithms are named `log_*`. Frame: x ahead, y left, metres, radians, seconds; `T_target_source` =
+(theta, tx, ty) maps points of the first scan (source) into the frame of the second (target).
+"""
+
+from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
+from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Annotation",
+    "ClusteringCRF",
+    "FeatureConfig",
+    "InferenceConfig",
+    "JointScanCRF",
+    "MatchingCRF",
+    "ModelConfig",
+    "PairPrediction",
+    "Prediction",
+    "Scan",
+    "ScanPair",
+    "ScanPairBatch",
+    "__version__",
+]

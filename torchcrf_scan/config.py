@@ -69,6 +69,18 @@ class SimulatorConfig:
                 raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
 
 
+MODEL_CARS = {"beams": 360, "fov": 360.0, "range_max": 9.0, "dropout": 0.3, "scale": 0.1, "ego_translation": 4.0, "ego_rotation": 0.25}
+INDOOR = {"scene": "indoor", "range_max": 30.0, "ego_translation": 0.4}
+WORLDS = {
+    "street": SimulatorConfig(),
+    "fast_street": SimulatorConfig(ego_translation=4.0, beams=361, range_noise=0.03, clutter=2.0),
+    "model_cars": SimulatorConfig(**MODEL_CARS),
+    "model_cars_dominant": SimulatorConfig(**MODEL_CARS, dominant_mover=0.5, aperture=0.5),
+    "indoor": SimulatorConfig(**INDOOR),
+    "street_dominant": SimulatorConfig(dominant_mover=0.5, aperture=0.5),
+}
+
+
 def _choose(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value}")
@@ -187,18 +199,24 @@ class DataConfig:
 
     Attributes:
         train, test: files, folders or glob patterns of pair files.
-        simulate_train, simulate_test: simulated worlds, `pairs` pairs each; worlds of train and test never share a seed.
+        simulate_train, simulate_test: names of simulated `WORLDS`, `pairs` pairs each; train and test never share a seed. For other
+            worlds, `torchcrf-scan simulate` writes files.
         pairs, sequences: of every simulated world.
         seed: of the simulator.
     """
 
     train: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
-    simulate_train: tuple[SimulatorConfig, ...] = (SimulatorConfig(),)
-    simulate_test: tuple[SimulatorConfig, ...] = (SimulatorConfig(),)
+    simulate_train: tuple[str, ...] = ("street",)
+    simulate_test: tuple[str, ...] = ("street",)
     pairs: int = 31
     sequences: int = 8
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("simulate_train", "simulate_test"):
+            for world in getattr(self, name):
+                _choose(name, world, tuple(WORLDS))
 
 
 @dataclass(frozen=True)

@@ -92,6 +92,7 @@ def test_one_point_is_a_shift() -> None:
 
 SPREAD = normal(4, 2)
 SAME = SPREAD[:1].expand(4, 2)
+TENTHS = torch.tensor([[0.1, 0.7]], dtype=torch.float64).expand(4, 2)  # their weighted mean is not exactly (0.1, 0.7)
 DEGENERATE = {
     "no points": (SPREAD[:0], SPREAD[:0], ones(0)),
     "no weight": (SPREAD, SPREAD.flip(0), 0 * ones(4)),
@@ -99,6 +100,7 @@ DEGENERATE = {
     "one weight": (SPREAD, SPREAD.flip(0), torch.eye(4, dtype=torch.float64)[1]),
     "two points": (SPREAD[:2], SPREAD[2:], ones(2)),
     "identical points": (SAME, SAME + 1, ones(4)),
+    "identical points, uneven weights": (TENTHS, TENTHS + torch.tensor([1.1, 0.3]), torch.tensor([0.3, 0.5, 0.9, 0.1])),
     "identical source points": (SAME, SPREAD, ones(4)),
     "identical target points": (SPREAD, SAME, ones(4)),
     "collinear points": (LINE, LINE.flip(0), ones(4)),
@@ -109,7 +111,7 @@ DEGENERATE = {
     ),
     "all but one weight vanishing": (SPREAD, SPREAD.flip(0), torch.tensor([1, 1e-23, 1e-23, 1e-30])),
 }
-UNDETERMINED = ["no weight", "one point", "one weight", "identical points", "identical source points", "identical target points"]
+UNDETERMINED = [name for name in DEGENERATE if name.startswith(("no weight", "one", "identical"))]
 
 
 def fit_degenerate(name: str, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
@@ -126,9 +128,10 @@ def test_degenerate_input_has_finite_values_and_gradients(name: str, dtype: torc
         assert gradient.isfinite().all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("name", UNDETERMINED)
-def test_an_undetermined_rotation_is_0_and_has_gradient_0(name: str) -> None:
-    motion, inputs = fit_degenerate(name, torch.float64)
+def test_an_undetermined_rotation_is_0_and_has_gradient_0(name: str, dtype: torch.dtype) -> None:
+    motion, inputs = fit_degenerate(name, dtype)
     assert motion[0].item() == 0
     for gradient in torch.autograd.grad(motion[0], inputs):
         assert not gradient.any()

@@ -12,6 +12,7 @@ from torchcrf_scan.inference.registration import nearest_points, register
 from torchcrf_scan.inference.surface import Surface, carry_back, look_along
 
 COARSE_POINTS = 120
+KEPT = 10  # hypotheses worth a refinement
 TRUNCATION = 3.0  # a residual of three units is as bad as any
 CONTRADICTION = 3.0  # units charged for a point that the other scan sees through (design finding 17)
 UNSEEN = 1.5  # units charged for a point of which the other scan says nothing; else flying off the map would be free
@@ -25,7 +26,7 @@ def unit_length(source: Surface, target: Surface) -> Tensor:
 
 def _one_way(moved: Tensor, surface: Surface, other: Surface) -> Tensor:
     """(H,) truncated residual of `surface`'s points, carried to (H, P, 2), in the other scan; per length, see-through charged."""
-    distance, index = nearest_points(moved, other.points)
+    distance, index = nearest_points(moved, other)
     unit = other.spacing[index] / 2 + 2 * other.noise
     residual = (distance / unit).clamp(max=TRUNCATION)
     sight = look_along(moved, other)
@@ -80,6 +81,7 @@ def background_pool(source: Surface, target: Surface, guess: Tensor, extra: Tens
     pool = pool[distinct(pool, cost, unit, 6)]
     by_segment = segment_hypotheses(source, target, pool[:3], u)
     pool = torch.cat([pool, by_segment])
+    pool = pool[distinct(pool, background_cost(pool, source, target), unit, KEPT)]
     pool = refine(polish(pool, source, target, u), source, target, u)
     cost = background_cost(pool, source, target)
     return pool[distinct(pool, cost, unit / 2, len(pool))]

@@ -7,7 +7,7 @@ No gradient passes through the start.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,9 +17,9 @@ from torchcrf_scan.features import candidates
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference import movers
 from torchcrf_scan.inference.background import background_pool, unit_length
 from torchcrf_scan.inference.cold import ransac_motions, shape_association
+from torchcrf_scan.inference.movers import HypothesisScore, find_movers
 from torchcrf_scan.inference.surface import Surface
 
 FEWEST_POINTS = 3  # a scan with fewer says nothing of the motion
@@ -42,9 +42,13 @@ class Start:
     association: Tensor
     target_tangents: Tensor
 
+    def background_alone(self) -> Start:
+        """The start of CRF-Matching, which has one motion."""
+        return replace(self, motions=self.motions[:, :1], active=self.active[:, :1])
+
 
 @torch.no_grad()
-def initialise(batch: ScanPairBatch, scales: Scales, score: movers.HypothesisScore, clusters: int) -> Start:
+def initialise(batch: ScanPairBatch, scales: Scales, score: HypothesisScore, clusters: int) -> Start:
     """Background and up to `clusters` - 1 movers of every pair; `batch.initial_motion` is one more guess, not trusted blindly."""
     shape_matches = shape_association(PairView.of(batch), scales)
     motions = batch.initial_motion[:, None].repeat(1, clusters, 1)
@@ -64,22 +68,20 @@ def initialise(batch: ScanPairBatch, scales: Scales, score: movers.HypothesisSco
 
 
 def start_pair(
-    source: Surface, target: Surface, guess: Tensor, match: Tensor, dt: float, score: movers.HypothesisScore, most: int
+    source: Surface, target: Surface, guess: Tensor, match: Tensor, dt: float, score: HypothesisScore, most: int
 ) -> Tensor:
     """(1 + G, 3) motions of one pair's background and movers. guess: (3,); match: (P,) shape associations, -1 none."""
     matched = match >= 0
     unit = unit_length(source, target)
     ransac = ransac_motions(source.points[matched], target.points[match[matched]], 3 * unit, RANSAC_STARTS)
     background = background_pool(source, target, guess, ransac)[0]
-    hypotheses = movers.hypothesise(source, target, background, dt)
-    found, _ = movers.select(hypotheses, source, target, background, score, most)
-    return torch.cat([background[None], found])
+    return torch.cat([background[None], find_movers(source, target, background, dt, score, most=most).motions])
 
 
 def nearest_association(batch: ScanPairBatch, motions: Tensor, active: Tensor, gate: float = 3.0) -> Tensor:
     """(B, N) target point that comes nearest under any active motion, -1 beyond `gate` units of footprint and noise."""
     moved = se2.apply(motions, batch.source[:, None])  # (B, C, N, 2)
-    distance = candidates.squared_distances(moved, batch.target[:, None], batch.target_mask[:, None])  # (B, C, N, M)
+    distance = candidates.squared_distances(moved, batch.target, batch.target_mask)  # (B, C, N, M)
     nearest, index = distance.masked_fill(~active[:, :, None, None], torch.inf).amin(1).min(-1)
     footprint = torch.linalg.vector_norm(batch.source, dim=-1) * FOOTPRINT
     unit = footprint / 2 + 2 * batch.range_noise[:, None]

@@ -28,7 +28,10 @@ SCREEN_POINTS = 8  # of a segment, to compare starts
 STARTS = 6  # of a segment, to register
 REGISTER_POINTS = 24
 FEATURE_POINTS = 40
+REACH = 6.0  # units, and the extent: how far from the members unexplained points of the target are asked for
+AROUND = 15  # beams
 USUAL_TURN = 0.1  # radians, standard deviation of a mover's turn between two scans
+LARGEST = 4.0  # standard deviations; what lies beyond tells no more
 SHARED = 0.4  # share of points in common from which two hypotheses compete
 
 FEATURES = (
@@ -37,6 +40,12 @@ FEATURES = (
     *("seen_through", "occluded", "distinct", "landing_open", "landing_seen_through_before"),
     *("target_open", "target_residual", "target_gain", "target_total_gain", "target_cover"),
     *("displacement", "displacement_in_spacings", "displacement_in_range", "displacement_in_extent", "along_surface", "rotation"),
+    *("gain_both_ways", "residual_to_best", "total_gain_to_best", "target_total_gain_to_best", "units_around", "scene_open"),
+)
+UNFITTED = (  # mean, scale and weight before any fit, with the value of all other features
+    ({"gain_both_ways": 2.0, "displacement": 1.5, "displacement_in_extent": 1.0, "residual": 1.0}, 0.0),
+    ({"extent": 1.0}, 1.0),
+    ({"gain_both_ways": 2.5, "displacement": 1.0, "displacement_in_extent": -3.0, "residual": -1.0, "explained": 1.0}, 0.0),
 )
 
 
@@ -69,7 +78,7 @@ def point_units(surface: Surface) -> Tensor:
 
 def residual_units(moved: Tensor, other: Surface) -> Tensor:
     """(...,) distance to the other scan in its local units, truncated. moved: (..., 2) in its frame."""
-    distance, index = nearest_points(moved, other.points)
+    distance, index = nearest_points(moved, other)
     return (distance / point_units(other)[index]).clamp(max=TRUNCATION)
 
 
@@ -239,18 +248,21 @@ class _Landing:
 
 
 def hypothesis_features(hypotheses: Hypotheses, source: Surface, target: Surface, background: Tensor) -> Tensor:
-    """(H, F) what tells a mover's motion from a wrong one, in the order of `FEATURES`; shares, logarithms and local units only."""
+    """(H, F) what tells a mover's motion from a wrong one, in the order of `FEATURES`; shares, logarithms and local units only.
+
+    Gains are over the background (3,); `before` and `open` mean under the background.
+    """
     if not len(hypotheses):
         return background.new_zeros(0, len(FEATURES))
     leftover = Leftover.of(source, target, background)
     landing = _Landing.of(hypotheses, source, target)
-    columns = (
-        *_shape_features(hypotheses, landing, source),
-        *_source_features(landing, leftover, hypotheses, target),
-        *_target_features(landing, leftover, source, target),
-        *_motion_features(hypotheses, landing, source, background),
-    )
-    return torch.stack(columns, dim=-1)
+    columns = _shape_features(hypotheses, landing, source)
+    columns |= _source_features(hypotheses, landing, leftover, target)
+    columns |= _target_features(landing, leftover, source, target)
+    columns |= _motion_features(hypotheses, landing, source, background)
+    columns |= _rival_features(hypotheses, columns)
+    columns |= _scene_features(hypotheses, leftover)
+    return torch.stack([columns[name] for name in FEATURES], dim=-1)
 
 
 def _extent(landing: _Landing, source: Surface) -> tuple[Tensor, Tensor]:
@@ -264,85 +276,113 @@ def _extent(landing: _Landing, source: Surface) -> tuple[Tensor, Tensor]:
     return (middle + spread).clamp(min=0).sqrt(), (middle - spread).clamp(min=0).sqrt()
 
 
-def _shape_features(hypotheses: Hypotheses, landing: _Landing, source: Surface) -> tuple[Tensor, ...]:
+def _shape_features(hypotheses: Hypotheses, landing: _Landing, source: Surface) -> dict[str, Tensor]:
     size = hypotheses.members.sum(-1).to(source.points)
     segment_size = torch.bincount(source.segment).to(size)[source.segment]
     whole = (hypotheses.members * segment_size).sum(-1) / size
     long, across = _extent(landing, source)
     unit = landing.mean(point_units(source)[landing.index])
-    ranges = landing.mean(source.ranges[landing.index])
-    return (
-        size.log(),
-        (size / whole).clamp(max=1.0),
-        (long / unit).log1p(),
-        1 - across / long.clamp(min=1e-6),
-        (ranges / source.ranges.median()).log(),
-    )
+    return {
+        "size": size.log(),
+        "share_of_segment": (size / whole).clamp(max=1.0),
+        "extent": (long / unit).log1p(),
+        "linearity": 1 - across / long.clamp(min=1e-6),
+        "range": (landing.mean(source.ranges[landing.index]) / source.ranges.median()).log(),
+    }
 
 
-def _source_features(landing: _Landing, leftover: Leftover, hypotheses: Hypotheses, target: Surface) -> tuple[Tensor, ...]:
+def _source_features(hypotheses: Hypotheses, landing: _Landing, leftover: Leftover, target: Surface) -> dict[str, Tensor]:
     sight = look_along(landing.moved, target)
     units = torch.where(sight.occluded, landing.units.clamp(max=OPEN), landing.units)
     before = leftover.source[landing.index]
     gain = landing.mean(before - units)
-    used = (landing.target_units < OPEN).sum(-1)
-    return (
-        landing.mean(units),
-        gain,
-        (gain.clamp(min=0) * hypotheses.members.sum(-1)).log1p(),
-        landing.mean(units < EXPLAINED),
-        landing.mean(before >= OPEN),
-        landing.mean(leftover.source_sight.occluded[landing.index]),
-        landing.mean(leftover.source_sight.seen_through[landing.index]),
-        landing.mean(sight.seen_through),
-        landing.mean(sight.occluded),
-        (used / hypotheses.members.sum(-1)).log1p(),
-        landing.mean(leftover.target[landing.nearest] >= OPEN),
-        landing.mean(leftover.target_sight.seen_through[landing.nearest]),
-    )
+    size = hypotheses.members.sum(-1)
+    return {
+        "residual": landing.mean(units),
+        "gain": gain,
+        "total_gain": (gain.clamp(min=0) * size).log1p(),
+        "explained": landing.mean(units < EXPLAINED),
+        "open_before": landing.mean(before >= OPEN),
+        "occluded_before": landing.mean(leftover.source_sight.occluded[landing.index]),
+        "seen_through_before": landing.mean(leftover.source_sight.seen_through[landing.index]),
+        "seen_through": landing.mean(sight.seen_through),
+        "occluded": landing.mean(sight.occluded),
+        "distinct": ((landing.target_units < OPEN).sum(-1) / size).log1p(),
+        "landing_open": landing.mean(leftover.target[landing.nearest] >= OPEN),
+        "landing_seen_through_before": landing.mean(leftover.target_sight.seen_through[landing.nearest]),
+    }
 
 
-def _target_features(landing: _Landing, leftover: Leftover, source: Surface, target: Surface) -> tuple[Tensor, ...]:
+def _target_features(landing: _Landing, leftover: Leftover, source: Surface, target: Surface) -> dict[str, Tensor]:
     is_open = leftover.target >= OPEN
-    reach = 6 + _extent(landing, source)[0][:, None] / point_units(target)  # (H, M) units
+    reach = REACH + _extent(landing, source)[0][:, None] / point_units(target)  # (H, M) units
     is_near = is_open & (landing.target_units < reach)
     count = is_near.sum(-1)
     units = landing.target_units.clamp(max=TRUNCATION)
-    residual = (units * is_near).sum(-1) / count.clamp(min=1)
     gain = ((leftover.target - units) * is_near).sum(-1)
     landed = torch.zeros(len(count), int(target.segment.max()) + 1, dtype=torch.bool, device=count.device)
-    landed.scatter_(1, target.segment[landing.nearest], landing.units < OPEN)
-    there = landed[:, target.segment] & is_open  # (H, M)
-    cover = (there & (units < OPEN)).sum(-1) / there.sum(-1).clamp(min=1)
-    return count.to(gain).log1p(), residual, gain / count.clamp(min=1), gain.clamp(min=0).log1p(), cover
+    landed.scatter_(1, target.segment[landing.nearest], True)
+    there = landed[:, target.segment] & is_open  # (H, M) unexplained points of the segments that the members land on
+    return {
+        "target_open": count.to(gain).log1p(),
+        "target_residual": (units * is_near).sum(-1) / count.clamp(min=1),
+        "target_gain": gain / count.clamp(min=1),
+        "target_total_gain": gain.clamp(min=0).log1p(),
+        "target_cover": (there & (units < OPEN)).sum(-1) / there.sum(-1).clamp(min=1),
+    }
 
 
-def _motion_features(hypotheses: Hypotheses, landing: _Landing, source: Surface, background: Tensor) -> tuple[Tensor, ...]:
+def _motion_features(hypotheses: Hypotheses, landing: _Landing, source: Surface, background: Tensor) -> dict[str, Tensor]:
     points = source.points[landing.index]
     step = landing.moved - se2.apply(background, points)  # (H, L, 2)
     shift = torch.stack([landing.mean(step[..., 0]), landing.mean(step[..., 1])], dim=-1)
     length = torch.linalg.vector_norm(shift, dim=-1).clamp(min=1e-6)
     tangent = se2.rotate(background[0], source.tangent[landing.index])
-    along = landing.mean((tangent * shift[:, None]).sum(-1).abs()) / length
-    turn = se2.wrap(hypotheses.motions[:, 0] - background[0]).abs()
-    long = _extent(landing, source)[0]
-    unit = landing.mean(point_units(source)[landing.index])
-    spacing = landing.mean(source.ranges[landing.index]) * source.step
-    return (
-        (length / unit).log1p(),
-        (length / spacing).log1p(),
-        length / landing.mean(source.ranges[landing.index]),
-        (length / long.clamp(min=1e-6)).log1p(),
-        along,
-        (turn / USUAL_TURN).log1p(),
-    )
+    ranges = landing.mean(source.ranges[landing.index])
+    return {
+        "displacement": (length / landing.mean(point_units(source)[landing.index])).log1p(),
+        "displacement_in_spacings": (length / (ranges * source.step)).log1p(),
+        "displacement_in_range": length / ranges,
+        "displacement_in_extent": (length / _extent(landing, source)[0].clamp(min=1e-6)).log1p(),
+        "along_surface": landing.mean((tangent * shift[:, None]).sum(-1).abs()) / length,
+        "rotation": (se2.wrap(hypotheses.motions[:, 0] - background[0]).abs() / USUAL_TURN).log1p(),
+    }
+
+
+def _rival_features(hypotheses: Hypotheses, columns: dict[str, Tensor]) -> dict[str, Tensor]:
+    """How much worse a hypothesis is than the best that moves nearly the same points."""
+    is_rival = _share_in_common(hypotheses.members) > 0.7
+
+    def short_of_best(values: Tensor) -> Tensor:
+        return values - torch.where(is_rival, values, -torch.inf).amax(-1)
+
+    return {
+        "gain_both_ways": (columns["total_gain"].expm1() + columns["target_total_gain"].expm1()).log1p(),
+        "residual_to_best": -short_of_best(-columns["residual"]),
+        "total_gain_to_best": short_of_best(columns["total_gain"]),
+        "target_total_gain_to_best": short_of_best(columns["target_total_gain"]),
+    }
+
+
+def _scene_features(hypotheses: Hypotheses, leftover: Leftover) -> dict[str, Tensor]:
+    """How well the background fits the beams beside the members, and the rest of the scan."""
+    members = hypotheses.members.to(leftover.source)
+    wide = nn.functional.max_pool1d(members[None], 2 * AROUND + 1, 1, AROUND)[0]
+    beside, rest = wide - members, 1 - members
+    is_open = (leftover.source >= OPEN).to(members)
+    return {
+        "units_around": (beside @ leftover.source + 2) / (beside.sum(-1) + 3),  # as if 3 more points had 2 units in all
+        "scene_open": rest @ is_open / rest.sum(-1).clamp(min=1),
+    }
 
 
 class HypothesisScore(nn.Module):
-    """Probability that a hypothesis is a mover's motion: logistic in the standardised features; `learning.hypothesis_fit` fits it.
+    """Probability that a hypothesis is a mover's motion: logistic in the standardised features and their squares.
+
+    `learning.hypothesis_fit` fits it; until then a few hand-set weights do.
 
     Attributes:
-        mean, scale, weight: (F,), bias: () of the log-linear score.
+        mean, scale: (F,). weight: (2F,) of the standardised features, then of their squares. bias: ().
         threshold: () probability from which a hypothesis is accepted.
     """
 
@@ -354,15 +394,21 @@ class HypothesisScore(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(len(FEATURES)))
-        self.register_buffer("scale", torch.ones(len(FEATURES)))
-        self.register_buffer("weight", torch.zeros(len(FEATURES)))
-        self.register_buffer("bias", torch.tensor(0.0))
-        self.register_buffer("threshold", torch.tensor(0.3))
+        mean, scale, weight = (torch.tensor([table.get(name, usual) for name in FEATURES]) for table, usual in UNFITTED)
+        self.register_buffer("mean", mean)
+        self.register_buffer("scale", scale)
+        self.register_buffer("weight", torch.cat([weight, torch.zeros(len(FEATURES))]))
+        self.register_buffer("bias", torch.tensor(-6.0))
+        self.register_buffer("threshold", torch.tensor(0.4))
+
+    def terms(self, features: Tensor) -> Tensor:
+        """(..., F) features of `hypothesis_features` -> (..., 2F) the terms that the weights belong to."""
+        standard = ((features - self.mean) / self.scale).clamp(-LARGEST, LARGEST)
+        return torch.cat([standard, standard**2], dim=-1)
 
     def forward(self, features: Tensor) -> Tensor:
-        """features: (..., F) by `hypothesis_features`. Returns (...) probabilities."""
-        return (((features - self.mean) / self.scale) @ self.weight + self.bias).sigmoid()
+        """(..., F) features of `hypothesis_features` -> (...) probabilities."""
+        return (self.terms(features) @ self.weight + self.bias).sigmoid()
 
 
 @dataclass(frozen=True, slots=True)

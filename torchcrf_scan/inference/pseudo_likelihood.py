@@ -168,4 +168,6 @@ def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Paramete
 
 def for_background_alone(plugins: PlugIns) -> PlugIns:
     """Every point moves with the background: the plug-ins of CRF-Matching."""
-    return replace(plugins, motions=plugins.motions[:, :1], active=plugins.active[:, :1], cluster=torch.zeros_like(plugins.cluster))
+    label = plugins.label.clamp(max=0)
+    nowhere = torch.zeros_like(plugins.cluster)
+    return replace(plugins, motions=plugins.motions[:, :1], active=plugins.active[:, :1], cluster=nowhere, label=label)

@@ -11,11 +11,11 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.surface import Surface
 
 
-def nearest_points(moved: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance to and index of the nearest target point. moved: (..., P, 2); target: (M, 2). Returns (..., P) each."""
-    flat = moved.reshape(-1, 2)
-    distance, index = torch.cdist(flat, target, compute_mode="donot_use_mm_for_euclid_dist").min(-1)
-    return distance.view(moved.shape[:-1]), index.view(moved.shape[:-1])
+def nearest_points(moved: Tensor, target: Surface) -> tuple[Tensor, Tensor]:
+    """Distance to and index of the nearest target point. moved: (..., P, 2). Returns (..., P) each, without gradient."""
+    distance, index = target.tree.query(moved.detach().reshape(-1, 2).cpu().numpy())
+    shape = moved.shape[:-1]
+    return torch.from_numpy(distance).to(moved).view(shape), torch.from_numpy(index).to(moved.device).view(shape)
 
 
 def gauss_newton_step(moved: Tensor, partner: Tensor, tangent: Tensor, weights: Tensor, along: float) -> Tensor:
@@ -73,7 +73,7 @@ def register(
     """
     for gate, slack in zip(gates, along, strict=True):
         moved = se2.apply(motions, source)  # (H, P, 2)
-        distance, index = nearest_points(moved, target.points)
+        distance, index = nearest_points(moved, target)
         unit = gate + target.spacing[index] / 2
         robust = weights / (1 + (distance / unit) ** 2) ** 2
         step = gauss_newton_step(moved, target.points[index], target.tangent[index], robust, slack)

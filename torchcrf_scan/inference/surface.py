@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchcrf_scan.geometry import se2
@@ -30,6 +31,7 @@ class Surface:
         step: () usual bearing step, radians.
         noise: () standard deviation of a return, metres.
         is_closed: the scan covers the whole circle.
+        tree: the points in a k-d tree, for nearest neighbours.
     """
 
     points: Tensor
@@ -42,6 +44,7 @@ class Surface:
     step: Tensor
     noise: Tensor
     is_closed: bool
+    tree: cKDTree
 
     @classmethod
     def of(cls, points: Tensor, noise: Tensor, is_closed: bool) -> Surface:
@@ -73,6 +76,7 @@ class Surface:
             step=step,
             noise=noise,
             is_closed=is_closed,
+            tree=cKDTree(points.detach().cpu().numpy()),
         )
 
     def __len__(self) -> int:

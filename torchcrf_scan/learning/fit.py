@@ -5,7 +5,6 @@ Everything that is fitted is fitted on the given pairs alone, so a fold of a cro
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -22,19 +21,25 @@ from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.motion import Motions
 from torchcrf_scan.inference.pseudo_likelihood import Design, PlugIns
 from torchcrf_scan.learning.boosting_fit import fit_boosters
-from torchcrf_scan.learning.hypothesis_fit import fit_hypothesis_score
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.scales_fit import fit_scales
 from torchcrf_scan.learning.weights_fit import Watch, fit_weights, flatten
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
 
-log = logging.getLogger(__name__)
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """A batch of annotated pairs with its start; `fold` is its part of the out-of-fold margins."""
+
+    batch: ScanPairBatch
+    start: Start
+    fold: int
 
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
-    """A batch of training pairs with all that is taken as observed; `fold` is its part of the out-of-fold margins."""
+    """Material as one model sees it, with all that is taken as observed."""
 
     view: PairView
     start: Start
@@ -42,58 +47,59 @@ class Lesson:
     fold: int
 
 
-def fit(model: JointScanCRF, pairs: Sequence[ScanPair], config: LearningConfig, watch: dict[str, Watch] | None = None) -> None:
-    """Fits everything that `model` learns, in place.
+def gather_material(model: JointScanCRF, pairs: Sequence[ScanPair], config: LearningConfig) -> list[Material]:
+    """Batches of one fold each, with the start that `model` finds; several models may learn from them.
 
-    Args:
-        pairs: annotated pairs; raises ValueError where one is not.
-        watch: callbacks of the two weight fits, by chain: `association`, `clustering`.
+    Raises:
+        ValueError: a pair without annotation, or no pair.
     """
     bare = [pair.name for pair in pairs if pair.annotation is None]
     if bare or not pairs:
         raise ValueError(f"pairs: expected annotated pairs, got {bare[:3] or 'none'}")
+    folds = assign_folds(pairs, config.folds)
+    parts = {fold: [pair for pair, of in zip(pairs, folds, strict=True) if of == fold] for fold in sorted(set(folds))}
+    step = config.batch_size
+    batches = [(fold, part[k : k + step]) for fold, part in parts.items() for k in range(0, len(part), step)]
+    material = []
+    for fold, part in tqdm(batches, desc="InitialiseRT", unit="batch", leave=False):
+        batch = ScanPairBatch.collate(part)
+        material.append(Material(batch, model.initialise(batch), fold))
+    return material
+
+
+def fit(
+    model: JointScanCRF, material: Sequence[Material], config: LearningConfig, watch: dict[str, Watch] | None = None
+) -> None:
+    """Fits scales, boosters and weights of `model`, in place.
+
+    Args:
+        watch: callbacks of the two weight fits, by chain: `association`, `clustering`.
+    """
     watch = watch or {}
     generator = torch.Generator().manual_seed(config.seed)
     chains = model.config.chains
-    model.hypothesis_score = fit_hypothesis_score(pairs, seed=config.seed)
-    lessons = prepare(model, pairs, config, generator)
+    lessons = [prepare(model, part, config, generator) for part in material]
     views, plugins = [lesson.view for lesson in lessons], [lesson.plugins for lesson in lessons]
     model.scales.load_state_dict(fit_scales(views, plugins).state_dict())
+    predicted = [lesson.start.association for lesson in lessons]
     if chains != "clustering":
         margins = fit_all_boosters(model, lessons, config, generator)
-        log.info("association weights")
         designs = [association_design(model, lesson, margins[lesson.fold]) for lesson in lessons]
         set_weights(model, "association", fit_weights(flatten(designs, live_weights(model)), config, watch.get("association")))
+        predicted = [predict_association(model, lesson, margins[lesson.fold]) for lesson in lessons]
     if chains != "matching":
-        if chains == "joint":
-            predicted = [predict_association(model, lesson, margins[lesson.fold]) for lesson in lessons]
-        else:
-            predicted = [lesson.start.association for lesson in lessons]
-        log.info("clustering weights")
-        clustering = [cluster_design(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True)]
-        set_weights(model, "clustering", fit_weights(flatten(clustering, torch.ones(12)), config, watch.get("clustering")))
+        designs = [cluster_design(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True)]
+        live = torch.ones(len(CLUSTERING_WEIGHTS), dtype=torch.float64)
+        set_weights(model, "clustering", fit_weights(flatten(designs, live), config, watch.get("clustering")))
 
 
-def prepare(
-    model: JointScanCRF, pairs: Sequence[ScanPair], config: LearningConfig, generator: torch.Generator
-) -> list[Lesson]:
-    """Batches of one fold each, their starts and training plug-ins."""
-    lessons = []
-    folds = assign_folds(pairs, config.folds)
-    batches = [
-        (fold, part[k : k + config.batch_size])
-        for fold in sorted(set(folds))
-        for part in [[pair for pair, f in zip(pairs, folds, strict=True) if f == fold]]
-        for k in range(0, len(part), config.batch_size)
-    ]
-    for fold, part in tqdm(batches, desc="start", unit="batch", leave=False):
-        batch = ScanPairBatch.collate(part)
-        start = model.initialise(batch)
-        plugins = training_plugins(batch, start, config, generator)
-        if model.config.chains == "matching":
-            plugins = pseudo_likelihood.for_background_alone(plugins)
-        lessons.append(Lesson(model.view(batch), start, plugins, fold))
-    return lessons
+def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generator: torch.Generator) -> Lesson:
+    """The training plug-ins of one batch; for CRF-Matching every point moves with the background."""
+    plugins = training_plugins(part.batch, part.start, config, generator)
+    start = part.start
+    if model.config.chains == "matching":
+        plugins, start = pseudo_likelihood.for_background_alone(plugins), start.background_alone()
+    return Lesson(model.view(part.batch), start, plugins, part.fold)
 
 
 def assign_folds(pairs: Sequence[ScanPair], folds: int) -> list[int]:
@@ -147,7 +153,7 @@ def predict_association(model: JointScanCRF, lesson: Lesson, margins: Boosters) 
     with torch.no_grad():
         start = Start(plugins.motions, plugins.active, lesson.start.association, lesson.start.target_tangents)
         state = joint.first_state(lesson.view, start, parameters, config)
-        one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), config.clusters).to(plugins.motions)
+        one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), plugins.motions.shape[1] + 1).to(plugins.motions)
         state = replace(state, motions=Motions.start(plugins.motions, plugins.active), log_cluster=one_hot)
         found = joint.find_candidates(lesson.view, plugins.motions, plugins.active, config)
         return joint.update_association(lesson.view, state, found, parameters, config).association

@@ -19,12 +19,14 @@ from torchcrf_scan.scan import ScanPair
 MOST_MOVERS = 6
 FOUND_SHARE = 0.2  # of the views start from the background that is found, as in use; the others, cheaper, from the disturbed truth
 BACKGROUND_ERROR = 0.5  # units
+BUMP = 0.5  # units of range error that neighbouring beams share: a tilted sensor hits other heights
+BUMP_BEAMS = 8
 SKEW = 0.7  # units that a scan's ends are displaced by: the sensor moves while it turns
 KEPT_BEAMS = (0.5, 1.0)
 PURE = 0.7  # share of a mover's points in the members of a hypothesis that is taken as its
 TOLERANCE, TOLERANCE_SHARE = 1.0, 0.12  # units and share of the displacement up to which a motion is right
 THRESHOLDS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)
-REGULARISATION = 1.0
+REGULARISATION = 0.03  # inverse; looser weights fit the simulator, not the world
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +75,7 @@ def fit_logistic(features: Tensor, label: Tensor) -> HypothesisScore:
     score = HypothesisScore()
     score.mean.copy_(features.mean(0))
     score.scale.copy_(features.std(0).clamp(min=1e-3))
-    standard = ((features - score.mean) / score.scale).double().numpy()
-    regression = LogisticRegression(C=REGULARISATION, max_iter=500).fit(standard, label.numpy())
+    regression = LogisticRegression(C=REGULARISATION, max_iter=1000).fit(score.terms(features).double().numpy(), label.numpy())
     score.weight.copy_(torch.from_numpy(regression.coef_[0]))
     score.bias.fill_(float(regression.intercept_[0]))
     return score
@@ -91,7 +92,7 @@ def _view(pair: ScanPair, generator: torch.Generator) -> _View | None:
     source = Surface.of(batch.source[0][kept[0]], noise, pair.source.is_closed)
     target = Surface.of(batch.target[0][kept[1]], noise, pair.target.is_closed)
     unit = unit_length(source, target)
-    source = Surface.of(_skew(source, unit, generator), noise, pair.source.is_closed)
+    source = Surface.of(_bump(_skew(source, unit, generator), unit, generator), noise, pair.source.is_closed)
     motions = torch.from_numpy(pair.annotation.motions).to(source.points)
     body = torch.from_numpy(pair.annotation.body[pair.source.beam])[kept[0]]
     background = _background(source, target, motions[0], unit, generator)
@@ -114,6 +115,14 @@ def _skew(surface: Surface, unit: Tensor, generator: torch.Generator) -> Tensor:
     twist = SKEW * unit * torch.randn(3, generator=generator)
     twist = torch.cat([twist[:1] / surface.ranges.median(), twist[1:]])
     return se2.apply(phase[:, None] * twist, surface.points[:, None])[:, 0]
+
+
+def _bump(points: Tensor, unit: Tensor, generator: torch.Generator) -> Tensor:
+    """(P, 2) points whose ranges err alike where they are neighbours."""
+    knots = torch.randn(1, 1, len(points) // BUMP_BEAMS + 2, generator=generator) * BUMP * unit
+    errors = torch.nn.functional.interpolate(knots, len(points), mode="linear")[0, 0]
+    ranges = torch.linalg.vector_norm(points, dim=-1).clamp(min=1e-6)
+    return points * (1 + errors / ranges).clamp(min=0.5)[:, None]
 
 
 def _background(source: Surface, target: Surface, truth: Tensor, unit: Tensor, generator: torch.Generator) -> Tensor:

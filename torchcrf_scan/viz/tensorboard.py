@@ -1,0 +1,48 @@
+"""What a run shows in TensorBoard, and its pictures on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
+from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.viz.plots import plot_pair, save_figure
+
+
+class RunLog:
+    """Events and pictures of one run folder; a context manager."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.writer = SummaryWriter(str(folder / "events"))
+
+    def __enter__(self) -> RunLog:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.writer.close()
+
+    def objective(self, tag: str, step: int, loss: float, slope: float, weights: Tensor) -> None:
+        """One optimiser step of one chain: objective and gradient per node, and every weight by name."""
+        self.writer.add_scalar(f"objective/{tag}", loss, step)
+        self.writer.add_scalar(f"gradient/{tag}", slope, step)
+        names = ASSOCIATION_WEIGHTS if len(weights) == len(ASSOCIATION_WEIGHTS) else CLUSTERING_WEIGHTS
+        for name, value in zip(names, weights.tolist(), strict=True):
+            self.writer.add_scalar(f"weights/{tag}/{name}", value, step)
+
+    def metrics(self, method: str, summary: dict[str, float], step: int = 0) -> None:
+        """Every number of a summary that is one."""
+        for name, value in summary.items():
+            if np.isfinite(value):
+                self.writer.add_scalar(f"test/{name}/{method}", value, step)
+
+    def picture(self, pair: ScanPair, prediction: PairPrediction, step: int = 0) -> None:
+        """The pair with its prediction beside the truth: an event and a PNG."""
+        figure = plot_pair(pair, prediction)
+        save_figure(figure, self.folder / "pictures" / f"{pair.name or step}.png")
+        self.writer.add_figure("pair", figure, step, close=False)

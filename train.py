@@ -1,0 +1,43 @@
+"""Trains the model on simulated or recorded scan pairs and evaluates it on pairs of other sequences.
+
+    python train.py
+    python train.py --config configs/real.yaml --data.train 'PAIRS/datmo_overtakes_*.npz' --data.test 'PAIRS/kitti0001_*.npz'
+    python train.py --help
+
+The run folder (`--output`) holds the resolved config, versions, model, metrics, tables, pictures and TensorBoard events.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from jsonargparse import ArgumentParser
+
+from torchcrf_scan.config import Config
+from torchcrf_scan.evaluation.report import report
+from torchcrf_scan.learning.trainer import train
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parses the settings, trains, prints the tables."""
+    parser = ArgumentParser(description=__doc__)
+    parser.add_argument("--config", action="config", help="YAML file of settings")
+    parser.add_class_arguments(Config)
+    settings = parser.parse_args(argv)
+    config = Config(**{k: v for k, v in parser.instantiate(settings).items() if k != "config"})
+
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    folder = Path(config.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    parser.save(settings, folder / "config.yaml", overwrite=True)
+
+    scores = train(config)
+    for table in report(scores):
+        print(table.to_markdown(), end="\n\n")
+    print(f"run folder: {folder}  (tensorboard --logdir {folder})")
+
+
+if __name__ == "__main__":
+    main()
