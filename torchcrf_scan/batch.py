@@ -112,8 +112,9 @@ def _pad_points(scans: Sequence[Scan]) -> tuple[Tensor, Tensor]:
 
 def _range_noise(pair: ScanPair) -> float:
     """What the sensor says, else an estimate: on smooth surfaces the ranges' second difference is noise alone."""
-    if pair.source.range_noise is not None:
-        return pair.source.range_noise
+    stated = [scan.range_noise for scan in (pair.source, pair.target) if scan.range_noise is not None]
+    if stated:
+        return max(stated)
     second = np.concatenate([np.diff(scan.ranges, n=2) for scan in (pair.source, pair.target)])
     if len(second) == 0:
         return 0.01

@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def make_parser() -> ArgumentParser:
     """The parser of all commands."""
     description = "Associations, moving objects and motions between two consecutive planar laser scans."
-    parser = ArgumentParser(prog="torchcrf-scan", description=description, version=f"torchcrf-scan {__version__}")
+    parser = ArgumentParser(prog="torchcrf-scan", description=description, version=__version__)
     subcommands = parser.add_subcommands(dest="command")
     for name, command in COMMANDS.items():
         summary = (inspect.getdoc(command) or "").split("\n\nArgs:")[0]
@@ -83,17 +83,16 @@ def make_parser() -> ArgumentParser:
 
 def _command_parser(name: str, command: Callable[..., int], summary: str) -> ArgumentParser:
     """Options from the signature; a parameter `files` or `file` is given without a dash."""
-    inputs = {
-        "files": {"metavar": "PAIR.npz", "nargs": "+", "help": "pair files (.npz), folders of them, or glob patterns"},
-        "file": {"metavar": "PAIR.npz", "help": "a pair file (.npz)"},
-    }
     parameters = inspect.signature(command).parameters
-    usage = {"files": "PAIR.npz ...", "file": "PAIR.npz", "output": "--output OUTPUT"}
-    shown = [text for key, text in usage.items() if key in parameters]
+    forms = {"files": "PAIR.npz ...", "file": "PAIR.npz", "output": "--output OUTPUT"}
+    shown = [form for key, form in forms.items() if key in parameters]
     parser = ArgumentParser(description=summary, usage=" ".join(["torchcrf-scan", name, *shown, "[options]"]))
-    for key in inputs.keys() & parameters.keys():
-        parser.add_argument(key, type=str, **inputs[key])
-    parser.add_function_arguments(command, as_group=False, as_positional=False, skip=inputs.keys() & parameters.keys())
+    if "files" in parameters:
+        several = "pair files (.npz), folders of them, or glob patterns"
+        parser.add_argument("files", type=str, metavar="PAIR.npz", nargs="+", help=several)
+    if "file" in parameters:
+        parser.add_argument("file", type=str, metavar="PAIR.npz", help="a pair file (.npz)")
+    parser.add_function_arguments(command, as_group=False, as_positional=False, skip={"files", "file"})
     return parser
 
 
@@ -110,7 +109,7 @@ def simulate(output: str, simulator: SimulatorConfig, *, pairs: int = 31, sequen
         simulator: world and sensor
         pairs: number of pairs in all
         sequences: number of drives that they come from
-        seed: of everything drawn
+        seed: seed of everything drawn
     """
     from torchcrf_scan.data.simulate import simulate_pairs
 
@@ -148,8 +147,8 @@ def match(
         output: folder of the prediction files, made if need be
         model: folder of a saved model, or the name of one that the package ships
         candidates: target points considered for each source point, 0 for all; as the model was saved where absent
-        device: that torch computes on, e.g. cpu or cuda
-        threads: that torch computes with; its own choice where absent
+        device: device that torch computes on, e.g. cpu or cuda
+        threads: number of threads that torch computes with; its own choice where absent
     """
     paths = find_files(files)
     targets = {path: _prediction_path(path, Path(output)) for path in paths}
@@ -158,10 +157,10 @@ def match(
     failures: list[str] = []
     with tqdm(total=len(paths), unit="pair", disable=None) as bar:
         for part in _parts(paths):
-            read = {path: pair for path in part if (pair := _attempt(failures, read_pair, path)) is not None}
-            for (path, pair), prediction in zip(read.items(), network.match_pairs(list(read.values())), strict=True):
+            pairs = {path: pair for path in part if (pair := _attempt(failures, read_pair, path)) is not None}
+            for path, prediction in _match_batch(network, pairs, failures).items():
                 if _attempt(failures, _write, targets[path], prediction):
-                    bar.write(describe(pair, prediction))
+                    bar.write(describe(pairs[path], prediction))
             bar.update(len(part))
     print(f"{len(paths) - len(failures)} of {len(paths)} pairs matched, predictions in {output}")
     for failure in failures:
@@ -172,13 +171,17 @@ def match(
 def describe(pair: ScanPair, prediction: PairPrediction) -> str:
     """One line: the sensor's motion, the movers with speed and size, and the outliers."""
     theta, x, y = se2.inverse(prediction.motions[BACKGROUND]).tolist()
-    ego = f"sensor {x:+.2f} m ahead, {y:+.2f} m left, {math.degrees(theta):+.1f} deg"
+    ego = f"sensor {_signed(x, 2)} m ahead, {_signed(y, 2)} m left, {_signed(math.degrees(theta), 1)} deg"
     sizes = [int((prediction.cluster == k).sum()) for k in range(1, len(prediction.motions))]
     movers = [f"{speed:.2f} m/s ({size} points)" for speed, size in zip(mover_speeds(pair, prediction), sizes, strict=True)]
     moving = f"{len(movers)} moving: {', '.join(movers)}" if movers else "nothing moving"
     outliers = int((prediction.association[pair.source.beam] < 0).sum())
     settled = "" if prediction.converged else "; not converged"
     return f"{pair.name}: {ego}; {moving}; {outliers} of {len(pair.source)} points outliers{settled}"
+
+
+def _signed(value: float, digits: int) -> str:
+    return f"{round(value, digits) + 0.0:+.{digits}f}"  # + 0.0: never -0.00
 
 
 def mover_speeds(pair: ScanPair, prediction: PairPrediction) -> list[float]:
@@ -191,6 +194,17 @@ def mover_speeds(pair: ScanPair, prediction: PairPrediction) -> list[float]:
         end = se2.apply(se2.compose(to_source, motion), centroid[None])[0]
         speeds.append(float(np.linalg.norm(end - centroid)) / pair.dt)
     return speeds
+
+
+def _match_batch(network: JointScanCRF, pairs: Mapping[Path, ScanPair], failures: list[str]) -> dict[Path, PairPrediction]:
+    """The predictions; where the batch fails, those of each pair alone, so that a bad one does not lose the others."""
+    try:
+        return dict(zip(pairs, network.match_pairs(list(pairs.values())), strict=True))
+    except (ValueError, RuntimeError) as error:
+        if len(pairs) == 1:
+            failures.append(f"{next(iter(pairs))}: {_one_line(error)}")
+            return {}
+    return {path: found for one in pairs for path, found in _match_batch(network, {one: pairs[one]}, failures).items()}
 
 
 def _prediction_path(path: Path, folder: Path) -> Path:
@@ -231,11 +245,11 @@ def evaluate(
         files: pair files with annotation
         predictions: folder of prediction files named like the pair files, instead of a method
         method: joint (the model), start (its start and nearest points, no field) or static (nothing moves); joint where absent
-        model: folder of a saved model, or the name of one that the package ships; the latter's usual one where absent
+        model: folder of a saved model, or the name of one that the package ships; simulated where absent
         json: file for all figures with all digits
         candidates: target points considered for each source point, 0 for all; as the model was saved where absent
-        device: that torch computes on, e.g. cpu or cuda
-        threads: that torch computes with; its own choice where absent
+        device: device that torch computes on, e.g. cpu or cuda
+        threads: number of threads that torch computes with; its own choice where absent
     """
     from torchcrf_scan.evaluation.metrics import score_pair
     from torchcrf_scan.evaluation.report import report

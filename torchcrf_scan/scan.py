@@ -73,8 +73,9 @@ class Scan:
             ValueError: wrong shapes, neither or both forms of bearings, bearings not finite or decreasing.
         """
         ranges = _vector("ranges", ranges)
-        if (bearings is None) == (angle_min is None or angle_increment is None):
-            raise ValueError("bearings: expected either bearings or both angle_min and angle_increment, got neither or both")
+        steps = [value for value in (angle_min, angle_increment) if value is not None]
+        if len(steps) != (2 if bearings is None else 0):
+            raise ValueError("bearings: expected either bearings or both angle_min and angle_increment, got neither, half or both")
         if bearings is None:
             assert angle_min is not None and angle_increment is not None
             bearings = angle_min + angle_increment * np.arange(len(ranges))
@@ -105,6 +106,7 @@ class Scan:
 
     def to_beams(self, values: NDArray[Any], fill: Any) -> NDArray[Any]:
         """Scatters (N, ...) values of the points to (n_beams, ...), `fill` where the beam returned nothing."""
+        assert len(values) == len(self)
         out = np.full((self.n_beams, *values.shape[1:]), fill, dtype=values.dtype)
         out[self.beam] = values
         return out

@@ -26,7 +26,7 @@ def test_the_nearest_under_any_active_motion(n: int, m: int, C: int, K: int, ext
         best = [min(apart[k][j] for k in range(C) if active[0, k]) for j in range(m)]
         expected = sorted(sorted(range(m), key=best.__getitem__)[:K])
         assert found.index[0, i][found.mask[0, i]].tolist() == expected
-        assert found.nearest[0, i].tolist() == [row.index(min(row)) for row in apart]
+        assert found.nearest[0, i][active[0]].tolist() == [apart[k].index(min(apart[k])) for k in range(C) if active[0, k]]
 
 
 def test_real_candidates_come_first_and_rise() -> None:
@@ -55,7 +55,7 @@ def test_an_inactive_motion_proposes_nothing() -> None:
         found = by_motion(points, points, all_real(points), motions, torch.tensor([[True, is_active]]), 2)
         assert expected <= set(found.index[0, 0].tolist())
         assert (5 in found.index[0, 0].tolist()) is is_active
-    assert found.nearest[0, 0].tolist() == [0, 5]  # of every motion, active or not
+        assert found.nearest[0, 0, : 1 + is_active].tolist() == [0, 5][: 1 + is_active]
 
 
 def test_an_empty_target_has_no_candidates() -> None:
@@ -108,6 +108,11 @@ def test_squared_distances(n: int, m: int) -> None:
     found = squared_distances(moved, target, mask)
     assert_close(found[0], torch.cdist(moved[0], target[0]) ** 2)
     assert found[1, :, m - 1].tolist() == [math.inf] * n
+
+
+def test_squared_distances_under_many_motions() -> None:
+    moved, target, mask = normal(2, 3, 4, 2, seed=1), normal(2, 5, 2, seed=2), torch.ones(2, 5, dtype=torch.bool)
+    assert_close(squared_distances(moved, target, mask), torch.cdist(moved, target[:, None]) ** 2)
 
 
 def test_every_target() -> None:

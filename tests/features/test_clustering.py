@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 from support import all_real, assert_close, generator, make_points, normal, pad
 from torch import Tensor
 
-from torchcrf_scan.features.candidates import squared_distances
 from torchcrf_scan.features.clustering import Correspondence, correspond, local_features, pairwise_features
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
@@ -38,7 +37,8 @@ def make_case(n: int, m: int, C: int, seed: int) -> tuple[Tensor, Tensor, Tensor
 def meet(source: Tensor, target: Tensor, motions: Tensor, association: Tensor, target_mask: Tensor | None = None) -> Correspondence:
     mask = all_real(target) if target_mask is None else target_mask
     moved = se2.apply(motions, source[:, None])
-    nearest = squared_distances(moved, target[:, None], mask[:, None]).argmin(-1).transpose(1, 2)
+    apart = torch.cdist(moved.detach().transpose(1, 2), target.detach()[:, None]).masked_fill(~mask[:, None, None], torch.inf)
+    nearest = apart.argmin(-1)  # (B, N, C)
     return correspond(source, target, motions, nearest, association)
 
 

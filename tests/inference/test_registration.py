@@ -39,7 +39,8 @@ def random_weights(*shape: int, seed: int) -> Tensor:
 @given(st.integers(1, 6), st.integers(1, 6), SEEDS)
 def test_nearest_points(P: int, M: int, seed: int) -> None:
     moved, target = normal(2, P, 2, seed=seed), normal(M, 2, seed=seed + 1)
-    distance, index = nearest_points(moved, target)
+    surface = Surface.of(target, torch.tensor(0.01, dtype=torch.float64), False)
+    distance, index = nearest_points(moved, surface)
     assert distance.shape == index.shape == (2, P)
     for h, i in np.ndindex(2, P):
         apart = [math.dist(moved[h, i].tolist(), q) for q in target.tolist()]

@@ -60,6 +60,14 @@ def test_segments_end_at_depth_jumps() -> None:
     assert across.max() < 0.01  # an arc is met at a right angle, up to its ends
 
 
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_noise_excuses_a_small_jump(scale: float) -> None:
+    points = scale * polar(torch.tensor([5.0] * 10 + [5.6] * 10, dtype=torch.float64), degrees(-9, 10, 20))
+    quiet, loud = (Surface.of(points, scale * noise, False) for noise in (0.1 * NOISE, 2 * NOISE))
+    assert quiet.segment.unique().tolist() == [0, 1]
+    assert loud.segment.unique().tolist() == [0]
+
+
 def test_missing_beams_split_a_wall_where_the_hole_is_wide() -> None:
     bearings = degrees(-30, 30, 121)
     narrow, wide = torch.arange(121) != 60, (torch.arange(121) - 60).abs() > 15

@@ -52,7 +52,7 @@ class StumpEnsemble(nn.Module):
         Lets what does not change between iterations be kept: only the registered channel depends on the motions (spec 2.5.4).
         """
         rows = slice(first, first + phi.shape[-1])
-        flat = phi.detach().movedim(-1, 0).flatten(1).contiguous()  # (n, P)
+        flat = phi.detach().reshape(-1, phi.shape[-1]).T.contiguous()  # (n, P)
         place = torch.searchsorted(self.thresholds[rows].to(flat.dtype), flat)  # thresholds below phi
         return self.table[rows].gather(1, place).sum(0).view(phi.shape[:-1])
 

@@ -17,7 +17,7 @@ class Candidates:
     Attributes:
         index: (B, N, K) target points.
         mask: (B, N, K) bool, real candidates (fewer than K where the target scan is short).
-        nearest: (B, N, C) nearest target point under every motion.
+        nearest: (B, N, C) nearest target point under every active motion; 0 under the others.
     """
 
     index: Tensor
@@ -43,15 +43,18 @@ def by_motion(
 
     Args:
         source_points: (B, N, 2); target_points: (B, M, 2); target_mask: (B, M); motions: (B, C, 3); active: (B, C).
-        count: K; memory and time grow with B C N M.
+        count: K; time grows with B C N M, memory with B N M.
     """
     with torch.no_grad():  # a choice of states, not a function to follow
-        moved = se2.apply(motions, source_points[:, None])  # (B, C, N, 2)
-        distance = squared_distances(moved, target_points, target_mask)  # (B, C, N, M)
-        nearest = distance.argmin(-1).transpose(1, 2)  # (B, N, C)
+        B, C = active.shape
+        nearest = torch.zeros(B, source_points.shape[1], C, dtype=torch.int64, device=active.device)
+        over_motions = source_points.new_full((B, source_points.shape[1], target_points.shape[1]), torch.inf)
+        for c in active.any(0).nonzero()[:, 0].tolist():  # a motion at a time: the largest tensor stays (B, N, M)
+            distance = squared_distances(se2.apply(motions[:, c], source_points), target_points, target_mask)
+            nearest[..., c] = torch.where(active[:, c, None], distance.argmin(-1), 0)
+            over_motions = torch.where(active[:, c, None, None], torch.minimum(over_motions, distance), over_motions)
         if count == 0 or count >= target_points.shape[1]:
             return Candidates(*every_target(source_points, target_mask), nearest)
-        over_motions = distance.masked_fill(~active[:, :, None, None], torch.inf).amin(1)  # (B, N, M)
         closest, index = over_motions.topk(count, dim=-1, largest=False)
         mask = closest < torch.inf
         order = torch.where(mask, index, target_points.shape[1]).argsort(-1)  # real ones first, ascending

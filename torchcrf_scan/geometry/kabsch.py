@@ -11,7 +11,7 @@ from torchcrf_scan.geometry.se2 import rotate
 def safe_atan2(y: Tensor, x: Tensor) -> Tensor:
     """atan2 whose value and gradient are 0 where both arguments are 0."""
     at_origin = (y == 0) & (x == 0)
-    return torch.atan2(y, torch.where(at_origin, torch.ones_like(x), x))
+    return torch.atan2(y.masked_fill(at_origin, 0.0), x.masked_fill(at_origin, 1.0))
 
 
 def kabsch(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
@@ -32,12 +32,19 @@ def kabsch(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
     p, q = source - source_mean[..., None, :], target - target_mean[..., None, :]
     sine = (share * (p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])).sum(-1)
     cosine = (share * (p * q).sum(-1)).sum(-1)
-    theta = safe_atan2(sine, cosine)
+    rounding = 8 * torch.finfo(p.dtype).eps * (share * _product_of_lengths(source, target)).sum(-1)
+    undetermined = torch.maximum(sine.abs(), cosine.abs()) <= rounding  # what is left of the spread is rounding noise
+    theta = safe_atan2(sine.masked_fill(undetermined, 0.0), cosine.masked_fill(undetermined, 0.0))
     return torch.cat([theta[..., None], target_mean - rotate(theta, source_mean)], dim=-1)
 
 
+def _product_of_lengths(p: Tensor, q: Tensor) -> Tensor:
+    with torch.no_grad():
+        return torch.linalg.vector_norm(p, dim=-1) * torch.linalg.vector_norm(q, dim=-1)
+
+
 def kabsch_naive(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
-    """`kabsch` by the singular value decomposition of the cross-covariance: slower, for any dimension, the test's oracle."""
+    """`kabsch` by the singular value decomposition of the cross-covariance: slower, the test's oracle."""
     total = weights.sum(-1, keepdim=True)
     share = (weights / torch.where(total > 0, total, torch.ones_like(total)))[..., None]
     source_mean, target_mean = (share * source).sum(-2), (share * target).sum(-2)

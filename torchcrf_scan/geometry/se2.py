@@ -48,7 +48,7 @@ def compose(second: Array, first: Array) -> Array:
 def inverse(motion: Array) -> Array:
     """The motion that undoes `motion`: (..., 3). The sensor's own motion is the inverse of the background's."""
     xp = _namespace(motion)
-    return xp.concatenate([-motion[..., :1], -rotate(-motion[..., 0], motion[..., 1:])], axis=-1)
+    return xp.concatenate([wrap(-motion[..., :1]), -rotate(-motion[..., 0], motion[..., 1:])], axis=-1)
 
 
 def distance(a: Array, b: Array) -> tuple[Array, Array]:

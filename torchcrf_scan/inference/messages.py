@@ -71,4 +71,6 @@ def chain_beliefs(log_unary: Tensor, log_pairwise: Tensor, mask: Tensor, tempera
     log_unary, log_pairwise = silence_padding(log_unary, log_pairwise, mask)
     forward, backward = chain_messages(log_unary, log_pairwise, temperature)
     beliefs = log_unary + forward + backward
-    return torch.log_softmax(beliefs if temperature == 0 else beliefs / temperature, dim=-1)
+    possible = beliefs.amax(-1, keepdim=True) > -torch.inf
+    beliefs = torch.log_softmax(torch.where(possible, beliefs if temperature == 0 else beliefs / temperature, 0.0), dim=-1)
+    return torch.where(possible, beliefs, -torch.inf)

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchcrf_scan.geometry import se2
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 GRAZING = math.radians(10.0)  # a surface met at a flatter angle looks like a depth jump (adaptive breakpoint detector)
 
@@ -49,11 +52,13 @@ class Surface:
     @classmethod
     def of(cls, points: Tensor, noise: Tensor, is_closed: bool) -> Surface:
         """points: (P, 2) in beam order, P >= 1; noise: () metres."""
+        from scipy.spatial import cKDTree
+
         ranges = torch.linalg.vector_norm(points, dim=-1)
         bearings = _unwrapped_bearings(points)
         following = points.roll(-1, 0) - points  # (P, 2), the last one leads round
         gap = torch.linalg.vector_norm(following, dim=-1)
-        turn = (bearings.roll(-1, 0) - bearings) % (2 * math.pi)
+        turn = _turn(bearings.roll(-1, 0) - bearings)
         step = turn[:-1].median() if len(points) > 1 else turn.new_tensor(math.radians(0.5))
         joined = gap <= _largest_gap(torch.minimum(ranges, ranges.roll(-1, 0)), turn, noise)
         joined &= turn < GRAZING
@@ -86,8 +91,12 @@ class Surface:
 def _unwrapped_bearings(points: Tensor) -> Tensor:
     """(P,) bearings of points in beam order, rising through the scan."""
     bearing = torch.atan2(points[:, 1], points[:, 0])
-    first = bearing[:1]
-    return first + (bearing - first) % (2 * math.pi - 1e-4)
+    return torch.cat([bearing[:1], _turn(bearing.diff())]).cumsum(0)
+
+
+def _turn(difference: Tensor) -> Tensor:
+    """Counter-clockwise angle in [0, 2 pi); a step back by rounding is no turn."""
+    return ((difference + 1e-4) % (2 * math.pi) - 1e-4).clamp(min=0)
 
 
 def _largest_gap(ranges: Tensor, turn: Tensor, noise: Tensor) -> Tensor:
@@ -124,13 +133,18 @@ def look_along(moved: Tensor, scan: Surface, margin: float = 3.0) -> Sight:
         margin: slack in units of spacing and noise.
     """
     ranges = torch.linalg.vector_norm(moved, dim=-1)
-    first = scan.bearings[0]
-    bearings = first + (torch.atan2(moved[..., 1], moved[..., 0]) - first) % (2 * math.pi)
+    first, half_step = scan.bearings[0], scan.step / 2
+    bearings = first + (torch.atan2(moved[..., 1], moved[..., 0]) - first + half_step) % (2 * math.pi) - half_step
     after = torch.searchsorted(scan.bearings, bearings.contiguous())
     M = len(scan)
-    inside = (after > 0) & (after < M)
-    left, right = (after - 1) % M, after % M
-    apart = torch.maximum((bearings - scan.bearings[left]) % (2 * math.pi), (scan.bearings[right] - bearings) % (2 * math.pi))
+    inside = bearings <= scan.bearings[-1] + half_step
+    if scan.is_closed:
+        left, right = (after - 1) % M, after % M
+    else:
+        left, right = (after - 1).clamp(min=0), after.clamp(max=M - 1)
+    apart = torch.maximum(_turn(bearings - scan.bearings[left]), _turn(scan.bearings[right] - bearings)).minimum(
+        torch.where(left == right, half_step, torch.inf)
+    )
     measured = (inside | scan.is_closed) & (apart < 2.5 * scan.step)
     slack = margin * (scan.noise + ranges * scan.step) + 0.02 * ranges
     near = torch.minimum(scan.ranges[left], scan.ranges[right])
