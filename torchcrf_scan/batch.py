@@ -135,7 +135,9 @@ def _collate_truth(pairs: Sequence[ScanPair], source_mask: Tensor, dtype: torch.
         cluster[b, :n] = truth.cluster[beam]
         known[b, :n] = ~truth.ignore[beam]
         motions[b, : len(truth.motions)] = truth.motions
-    return Truth(*map(torch.from_numpy, (association, cluster)), torch.from_numpy(motions).to(dtype), torch.from_numpy(known))
+    return Truth(
+        torch.from_numpy(association), torch.from_numpy(cluster), torch.from_numpy(motions).to(dtype), torch.from_numpy(known)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +176,9 @@ class Prediction:
         number = np.full(len(motions) + 1, -1)  # the last entry keeps -1 at -1
         number[[0, *movers]] = np.arange(len(movers) + 1)
         beam_of_point = np.append(pair.target.beam, -1)
-        confidences = [log.detach()[b, :n].exp().amax(-1).cpu().double().numpy() for log in (self.log_association, self.log_cluster)]
+        confidences = [
+            log.detach()[b, :n].exp().amax(-1).cpu().double().numpy() for log in (self.log_association, self.log_cluster)
+        ]
         return PairPrediction(
             association=pair.source.to_beams(beam_of_point[association], -1),
             cluster=pair.source.to_beams(number[cluster], -1),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,8 @@ class SimulatorConfig:
         scene: `street` (a car among facades, trees and traffic) or `indoor` (a robot among walls, furniture and people).
         beams: beams of the sensor.
         fov: field of view, degrees; 360 is a closed scan.
-        range_min, range_max: nearest and farthest return.
+        range_min: nearest return.
+        range_max: farthest return.
         range_noise: standard deviation of a return.
         dropout: share of beams that return nothing although they hit something.
         mixed_pixels: share of the depth edges where a beam returns a range between the near and the far surface.
@@ -22,7 +23,8 @@ class SimulatorConfig:
         dt: seconds between the scans of a pair.
         ego_translation: largest travel of the sensor per pair, before `scale`; indoors never more than 1.5 m/s.
         ego_rotation: largest turn of the sensor per pair, radians.
-        movers_min, movers_max: number of moving objects. No pair has more; one has fewer where some are out of sight.
+        movers_min: least number of moving objects; a pair has fewer where some are out of sight.
+        movers_max: largest number of moving objects.
         clutter: amount of hedges, bushes and low crowns, whose returns are not repeatable; 1 is an ordinary street.
         dominant_mover: probability that a truck drives beside the sensor and fills 40 to 50 % of the returns of a sequence.
         aperture: probability that a car is seen along one side only and slides along it.
@@ -69,14 +71,13 @@ class SimulatorConfig:
                 raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
 
 
-MODEL_CARS = {"beams": 360, "fov": 360.0, "range_max": 9.0, "dropout": 0.3, "scale": 0.1, "ego_translation": 4.0, "ego_rotation": 0.25}
-INDOOR = {"scene": "indoor", "range_max": 30.0, "ego_translation": 0.4}
+MODEL_CARS = SimulatorConfig(beams=360, fov=360.0, range_max=9.0, dropout=0.3, scale=0.1, ego_translation=4.0, ego_rotation=0.25)
 WORLDS = {
     "street": SimulatorConfig(),
     "fast_street": SimulatorConfig(ego_translation=4.0, beams=361, range_noise=0.03, clutter=2.0),
-    "model_cars": SimulatorConfig(**MODEL_CARS),
-    "model_cars_dominant": SimulatorConfig(**MODEL_CARS, dominant_mover=0.5, aperture=0.5),
-    "indoor": SimulatorConfig(**INDOOR),
+    "model_cars": MODEL_CARS,
+    "model_cars_dominant": replace(MODEL_CARS, dominant_mover=0.5, aperture=0.5),
+    "indoor": SimulatorConfig(scene="indoor", range_max=30.0, ego_translation=0.4),
     "street_dominant": SimulatorConfig(dominant_mover=0.5, aperture=0.5),
 }
 
@@ -101,7 +102,8 @@ class InferenceConfig:
         motion_weights: `hard` (labels, the paper's) or `soft` (beliefs; lets gradients reach the weights).
         motion_metric: `point` (Kabsch, the paper's) or `line` (robust point-to-line step).
         min_extent: metres; a cluster smaller than this takes the background's rotation.
-        rotation_tolerance, translation_tolerance: radians and metres below which a motion has settled.
+        rotation_tolerance: radians below which a motion has settled.
+        translation_tolerance: metres below which a motion has settled.
     """
 
     clusters: int = 8
@@ -169,13 +171,15 @@ class LearningConfig:
     """How the model is learned (spec 2, 6).
 
     Attributes:
-        rotation_noise, translation_noise: radians and metres of noise on the true motions.
+        rotation_noise: radians of noise on the true motions.
+        translation_noise: metres of noise on the true motions.
         start_share: share of the pairs whose features see InitialiseRT's motions instead.
         predicted_share: share of the pairs whose clustering features see predicted associations (A-28).
         folds: parts of the training pairs for out-of-fold margins; sequences stay whole. 0: margins on the same pairs (faithful).
         negatives: wrong pairs per true one for the data booster.
         prior: standard deviation s_w of the weights' Gaussian prior, on standardised features.
-        max_steps, tolerance: L-BFGS steps at most, and gradient per node at which it stops.
+        max_steps: L-BFGS steps at most.
+        tolerance: gradient per node at which L-BFGS stops.
         batch_size: pairs that are looked at at once.
         seed: of everything drawn while learning.
     """
@@ -198,10 +202,13 @@ class DataConfig:
     """Where annotated pairs come from: files, the simulator, or both.
 
     Attributes:
-        train, test: files, folders or glob patterns of pair files.
-        simulate_train, simulate_test: names of simulated `WORLDS`, `pairs` pairs each; train and test never share a seed. For other
-            worlds, `torchcrf-scan simulate` writes files.
-        pairs, sequences: of every simulated world.
+        train: files, folders or glob patterns of training pairs.
+        test: files, folders or glob patterns of test pairs.
+        simulate_train: names of simulated `WORLDS` to train on too, `pairs` pairs each. For other worlds, `torchcrf-scan simulate`
+            writes files.
+        simulate_test: names of simulated `WORLDS` to test on too; train and test never share a seed.
+        pairs: pairs of every simulated world.
+        sequences: sequences of every simulated world.
         seed: of the simulator.
     """
 

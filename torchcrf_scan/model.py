@@ -204,4 +204,6 @@ def find_weights(name_or_path: str | Path) -> Path:
     if (shipped / str(name_or_path) / "config.json").is_file():
         return shipped / str(name_or_path)
     names = sorted(entry.name for entry in shipped.iterdir()) if shipped.is_dir() else []
-    raise ValueError(f"name_or_path: expected a folder with config.json or one of {', '.join(names) or 'no'} shipped models, got {path}")
+    raise ValueError(
+        f"name_or_path: expected a folder with config.json or one of {', '.join(names) or 'no'} shipped models, got {path}"
+    )

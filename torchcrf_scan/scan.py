@@ -82,8 +82,9 @@ class Scan:
         bearings = _vector("bearings", bearings, len(ranges))
         if not np.isfinite(bearings).all():
             raise ValueError(f"bearings: expected finite numbers, got {np.count_nonzero(~np.isfinite(bearings))} that are not")
-        if (np.diff(bearings) < 0).any():
-            raise ValueError(f"bearings: expected counter-clockwise (non-decreasing), got a step back at {np.argmax(np.diff(bearings) < 0)}")
+        back = np.flatnonzero(np.diff(bearings) < 0)
+        if len(back):
+            raise ValueError(f"bearings: expected counter-clockwise (non-decreasing), got a step back after beam {back[0]}")
         with np.errstate(invalid="ignore"):
             valid = np.isfinite(ranges) & (ranges > max(range_min or 0.0, 0.0))
             if range_max is not None:

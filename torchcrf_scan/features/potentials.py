@@ -38,7 +38,9 @@ class PairView:
     def of(cls, batch: ScanPairBatch, wrap_closed: bool = True) -> PairView:
         """wrap_closed: neighbours wrap on a closed scan (A-06); off, they clamp as in the paper."""
         closed = [flags & wrap_closed for flags in (batch.source_closed, batch.target_closed)]
-        return cls(batch, describe(batch.source, batch.source_mask, closed[0]), describe(batch.target, batch.target_mask, closed[1]))
+        return cls(
+            batch, describe(batch.source, batch.source_mask, closed[0]), describe(batch.target, batch.target_mask, closed[1])
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,5 +122,3 @@ def clustering_potentials(local: Tensor, pairwise: Tensor, active: Tensor, weigh
     possible = torch.cat([active, active.new_ones(len(active), 1)], dim=-1)
     log_unary = (local @ weights[:4]).masked_fill(~possible[:, None], -torch.inf)
     return log_unary, pairwise @ weights[4:]
-
-

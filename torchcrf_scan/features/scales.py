@@ -20,7 +20,13 @@ ASSOCIATION_WEIGHTS = (
 )  # a01..a18
 CLUSTERING_WEIGHTS = (
     *("cluster_distance", "outlier", "cluster_inlier_in", "cluster_inlier_out"),
-    *("sequence", "neighbour_weight_same", "neighbour_weight_different", "neighbour_stiffness_same", "neighbour_stiffness_different"),
+    *(
+        "sequence",
+        "neighbour_weight_same",
+        "neighbour_weight_different",
+        "neighbour_stiffness_same",
+        "neighbour_stiffness_different",
+    ),
     *("neighbour_distance_same", "neighbour_distance_different", "pairwise_outlier"),
 )  # c01..c12
 

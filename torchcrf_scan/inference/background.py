@@ -76,7 +76,9 @@ def background_pool(source: Surface, target: Surface, guess: Tensor, extra: Tens
     starts = start_grid(source, target, guess)
     if extra is not None:
         starts = torch.cat([starts, extra])
-    pool = register(coarse, weights, target, starts, [8 * u, 8 * u, 6 * u, 6 * u, 4 * u, 4 * u, 3 * u, 2 * u], [1.0] * 4 + [0.3] * 4)
+    pool = register(
+        coarse, weights, target, starts, [8 * u, 8 * u, 6 * u, 6 * u, 4 * u, 4 * u, 3 * u, 2 * u], [1.0] * 4 + [0.3] * 4
+    )
     cost = background_cost(pool, source, target)
     pool = pool[distinct(pool, cost, unit, 6)]
     by_segment = segment_hypotheses(source, target, pool[:3], u)

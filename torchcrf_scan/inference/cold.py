@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.features import association, candidates
 from torchcrf_scan.features.potentials import PairView, state_mask
 from torchcrf_scan.features.scales import Scales

@@ -163,9 +163,7 @@ def update_association(view: PairView, state: State, found: Candidates, paramete
     potentials = association_potentials(unary, pairwise, found.mask, parameters.association)
     log_association = chain_beliefs(*potentials, batch.source_mask, config.temperature)
     labels = association_labels(log_association, found.index, batch.source_mask)
-    return replace(
-        state, candidates=found.index, candidate_mask=found.mask, log_association=log_association, association=labels
-    )
+    return replace(state, candidates=found.index, candidate_mask=found.mask, log_association=log_association, association=labels)
 
 
 def association_labels(log_association: Tensor, candidates: Tensor, mask: Tensor) -> Tensor:
@@ -182,9 +180,7 @@ def update_motions(view: PairView, start: Start, state: State, parameters: Param
     if config.motion_weights == "soft":
         support = soft_support(*geometry, support, state.candidates, state.log_association, state.log_cluster)
     scale = parameters.scales.cluster_distance
-    motions = estimate(
-        batch.source, support, state.motions, metric=config.motion_metric, scale=scale, min_extent=config.min_extent
-    )
+    motions = estimate(batch.source, support, state.motions, metric=config.motion_metric, scale=scale, min_extent=config.min_extent)
     return replace(state, motions=motions)
 
 

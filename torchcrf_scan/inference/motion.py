@@ -81,7 +81,13 @@ def hard_support(source: Tensor, target: Tensor, tangents: Tensor, association: 
 
 
 def soft_support(
-    source: Tensor, target: Tensor, tangents: Tensor, hard: Support, candidates: Tensor, log_association: Tensor, log_cluster: Tensor
+    source: Tensor,
+    target: Tensor,
+    tangents: Tensor,
+    hard: Support,
+    candidates: Tensor,
+    log_association: Tensor,
+    log_cluster: Tensor,
 ) -> Support:
     """Beliefs as weights and mean partners (A-18), so that gradients reach the feature weights.
 

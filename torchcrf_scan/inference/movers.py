@@ -168,16 +168,20 @@ def _are_near(surface: Surface, members: Tensor) -> Tensor:
     marks = _landmarks(surface.points, members)
     gap = torch.linalg.vector_norm(marks[:, 2] - marks.roll(-1, 0)[:, 1], dim=-1)
     footprint = torch.linalg.vector_norm(marks[:, 2], dim=-1) * surface.step
-    return (gap < SEGMENT_GAP * footprint + 6 * surface.noise) & (len(members) > 2 or torch.arange(len(members)) == 0)
+    return (gap < SEGMENT_GAP * footprint + 6 * surface.noise) & (
+        len(members) > 2 or torch.arange(len(members), device=gap.device) == 0
+    )
 
 
 def _landmarks(points: Tensor, members: Tensor) -> Tensor:
-    """(S, 3, 2): centroid, first and last point of every segment."""
+    """(S, 3, 2): centroid, first and last point of every segment, also of one that leads round the seam of a closed scan."""
     weights = members.to(points)
     centroid = weights @ points / weights.sum(-1, keepdim=True).clamp(min=1)
     order = torch.arange(len(points), device=points.device)
-    first = torch.where(members, order, len(points)).amin(-1).clamp(max=len(points) - 1)
-    last = torch.where(members, order, 0).amax(-1)
+    is_round = (members[:, 0] & members[:, -1])[:, None]
+    order = torch.where(is_round, (order + len(points) // 2) % len(points), order)  # (S, P)
+    first = torch.where(members, order, len(points)).argmin(-1)
+    last = torch.where(members, order, -1).argmax(-1)
     return torch.stack([centroid, points[first], points[last]], dim=1)
 
 

@@ -16,7 +16,14 @@ from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.features import candidates as candidate_search
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.association import pairwise_features
-from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, association_unary, registered_points, state_mask
+from torchcrf_scan.features.potentials import (
+    AssociationStates,
+    Boosters,
+    PairView,
+    association_unary,
+    registered_points,
+    state_mask,
+)
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.joint import Parameters
 

@@ -67,9 +67,7 @@ def gather_material(model: JointScanCRF, pairs: Sequence[ScanPair], config: Lear
     return material
 
 
-def fit(
-    model: JointScanCRF, material: Sequence[Material], config: LearningConfig, watch: dict[str, Watch] | None = None
-) -> None:
+def fit(model: JointScanCRF, material: Sequence[Material], config: LearningConfig, watch: dict[str, Watch] | None = None) -> None:
     """Fits scales, boosters and weights of `model`, in place.
 
     Args:

@@ -19,6 +19,7 @@ from torchcrf_scan.inference.surface import Surface
 from torchcrf_scan.scan import ScanPair
 
 MOST_MOVERS = 6
+IGNORED = -2  # body of a point that nobody annotated
 FOUND_SHARE = 0.15  # of the views start from the background that is found, as in use; the others, cheaper, from the disturbed truth
 BACKGROUND_ERROR = 0.5  # units
 BUMP = 0.5  # units of range error that neighbouring beams share: a tilted sensor hits other heights
@@ -115,7 +116,8 @@ def _view(pair: ScanPair, generator: torch.Generator) -> _View | None:
     unit = unit_length(source, target)
     source = Surface.of(_bump(_skew(source, unit, generator), unit, generator), noise, pair.source.is_closed)
     motions = torch.from_numpy(pair.annotation.motions).to(source.points)
-    body = torch.from_numpy(pair.annotation.body[pair.source.beam])[kept[0]]
+    known = np.where(pair.annotation.ignore, IGNORED, pair.annotation.body)
+    body = torch.from_numpy(known[pair.source.beam])[kept[0]]
     background = _background(source, target, motions[0], unit, generator)
     hypotheses = hypothesise(source, target, background, pair.dt)
     features = hypothesis_features(hypotheses, source, target, background)
@@ -156,10 +158,10 @@ def _background(source: Surface, target: Surface, truth: Tensor, unit: Tensor, g
 
 
 def label_hypotheses(hypotheses: Hypotheses, source: Surface, body: Tensor, motions: Tensor, unit: Tensor) -> Tensor:
-    """(H,) 1: moves mostly one true mover, and as it moved; 0: neither; -1: between, or a mover that hardly moved.
+    """(H,) 1: moves mostly one true mover, and as it moved; 0: neither; -1: between, a mover that hardly moved, or not annotated.
 
     Args:
-        body: (P,) true cluster of every point, -1 unknown. motions: (K+1, 3) of every cluster. unit: () metres.
+        body: (P,) true cluster of every point, -1 none, `IGNORED`. motions: (K+1, 3) of every cluster, NaN where unknown. unit: () metres.
     """
     if not len(hypotheses):
         return torch.zeros(0, dtype=torch.int64)
@@ -171,7 +173,8 @@ def label_hypotheses(hypotheses: Hypotheses, source: Surface, body: Tensor, moti
     tolerance = torch.maximum(TOLERANCE * unit, TOLERANCE_SHARE * travel)
     right = (pure >= PURE) & (which > 0) & (travel > unit) & (error < tolerance)
     between = (pure >= 0.5) & (which > 0) & (error < 1.5 * tolerance) & (travel > 0.5 * unit)
-    return torch.where(right, 1, torch.where(between, -1, 0))
+    between |= error.isnan() | ((hypotheses.members & (body == IGNORED)).sum(-1) > hypotheses.members.sum(-1) / 2)
+    return torch.where(between & ~right, -1, right.long())
 
 
 def _apart(one: Tensor, other: Tensor, points: Tensor, members: Tensor) -> Tensor:

@@ -59,9 +59,9 @@ def true_errors(view: PairView, plugins: PlugIns) -> dict[str, Tensor]:
     out: dict[str, Tensor] = {}
 
     def of_partner(values: Tensor) -> Tensor:
-        return values.gather(1, partner_index.squeeze(-1).view(*partner_index.shape[:2], *[1] * (values.dim() - 2)).expand(
-            -1, -1, *values.shape[2:]
-        ))
+        return values.gather(
+            1, partner_index.squeeze(-1).view(*partner_index.shape[:2], *[1] * (values.dim() - 2)).expand(-1, -1, *values.shape[2:])
+        )
 
     source, target = view.source_shape, view.target_shape
     for name, mine, theirs in (("dist", source.distance, target.distance), ("geo", source.geodesic, target.geodesic)):
@@ -117,5 +117,3 @@ def fit_outlier_constants(views: Sequence[PairView], plugins: Sequence[PlugIns],
     on_edges = torch.cat(edges)
     if len(on_edges):
         scales.pairwise_outlier.copy_(on_edges.quantile(WORST_SHARE, dim=0))
-
-

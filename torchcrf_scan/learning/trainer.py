@@ -117,9 +117,7 @@ class Cascade:
         matched = self.matching(batch, start.background_alone())
         clusters = self.clustering.config.inference.clusters - 1
         view, fitted = self.clustering.view(batch), self.matching.fitted
-        return movers_from_associations(
-            view, matched.motions[:, 0], matched.association, fitted, clusters, start.target_tangents
-        )
+        return movers_from_associations(view, matched.motions[:, 0], matched.association, fitted, clusters, start.target_tangents)
 
     def __call__(self, batch: ScanPairBatch, start: Start) -> Prediction:
         """Decodes a batch."""

@@ -48,6 +48,7 @@ def fit_weights(design: Design, config: LearningConfig, watch: Watch | None = No
     spread = torch.where(spread > 1e-9, spread, torch.ones_like(spread))
     scaled = Design(design.features / spread, design.mask, design.label, design.known)
     nodes = max(1, int(design.known.sum()))
+    step = 0
 
     def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
         weights = torch.from_numpy(values).requires_grad_()
@@ -62,7 +63,6 @@ def fit_weights(design: Design, config: LearningConfig, watch: Watch | None = No
             loss, slope = objective(intermediate_result.x)
             watch(step, loss, float(np.abs(slope).max()), torch.from_numpy(intermediate_result.x) / spread)
 
-    step = 0
     options = {"maxiter": config.max_steps, "gtol": config.tolerance, "ftol": 0.0, "maxcor": 10}
     start = np.zeros(design.features.shape[-1])
     found = minimize(objective, start, jac=True, method="L-BFGS-B", callback=look, options=options)

@@ -44,5 +44,5 @@ class RunLog:
     def picture(self, pair: ScanPair, prediction: PairPrediction, step: int = 0) -> None:
         """The pair with its prediction beside the truth: an event and a PNG."""
         figure = plot_pair(pair, prediction)
-        save_figure(figure, self.folder / "pictures" / f"{pair.name or step}.png")
+        save_figure(figure, self.folder / "pictures" / f"{step:02d}_{pair.name}.png")
         self.writer.add_figure("pair", figure, step, close=False)
