@@ -4,7 +4,7 @@ Frame: x ahead, y left, bearings counter-clockwise, metres, radians, seconds. Th
 second the `target`; a motion `T_target_source` = (theta, tx, ty) maps source points into the target frame.
 
 Two numberings live side by side. A *beam* is an entry of the arrays that came in, valid or not; a *point* is a valid return.
-Annotations and `PairPrediction` count beams (they are what files hold), tensors count points; `Scan.beam` leads from one to the other.
+Annotations and `PairPrediction` count beams (they are what files hold), tensors count points; `Scan.beam` leads to beams.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class Scan:
         if len(steps) != (2 if bearings is None else 0):
             raise ValueError("bearings: expected either bearings or both angle_min and angle_increment, got neither, half or both")
         if bearings is None:
-            assert angle_min is not None and angle_increment is not None
-            bearings = angle_min + angle_increment * np.arange(len(ranges))
+            first, increment = steps
+            bearings = first + increment * np.arange(len(ranges))
         bearings = _vector("bearings", bearings, len(ranges))
         if not np.isfinite(bearings).all():
             raise ValueError(f"bearings: expected finite numbers, got {np.count_nonzero(~np.isfinite(bearings))} that are not")

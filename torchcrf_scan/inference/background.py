@@ -1,4 +1,4 @@
-"""The start of the background's motion (InitialiseRT, first half): a pool of robust registrations, the best by what it leaves open."""
+"""The start of the background's motion (InitialiseRT, first half): a pool of registrations, the best by what it leaves open."""
 
 from __future__ import annotations
 

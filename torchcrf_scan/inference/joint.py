@@ -65,7 +65,7 @@ class State:
 
 
 def decode(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> Prediction:
-    """Labels and motions of a batch by the sweep schedule; differentiable through beliefs, and through motions where they are soft."""
+    """Labels and motions of a batch by the sweep schedule; differentiable through beliefs and, where soft, through motions."""
     batch, config = view.batch, model.inference
     state = first_state(view, start, parameters, config)
     before = older = state

@@ -168,9 +168,9 @@ def _are_near(surface: Surface, members: Tensor) -> Tensor:
     marks = _landmarks(surface.points, members)
     gap = torch.linalg.vector_norm(marks[:, 2] - marks.roll(-1, 0)[:, 1], dim=-1)
     footprint = torch.linalg.vector_norm(marks[:, 2], dim=-1) * surface.step
-    return (gap < SEGMENT_GAP * footprint + 6 * surface.noise) & (
-        len(members) > 2 or torch.arange(len(members), device=gap.device) == 0
-    )
+    is_last = torch.arange(len(members), device=gap.device) == len(members) - 1
+    is_counted = is_last & (len(members) == 2)  # with the first, already
+    return (gap < SEGMENT_GAP * footprint + 6 * surface.noise) & ~is_counted
 
 
 def _landmarks(points: Tensor, members: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The start of the paper configuration (spec 7.3, A-19): the association chain alone, then runs of points that it moved elsewhere."""
+"""The paper configuration's start (spec 7.3, A-19): the association chain alone, then runs of points that it moved elsewhere."""
 
 from __future__ import annotations
 

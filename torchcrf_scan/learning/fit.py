@@ -116,7 +116,7 @@ def assign_folds(pairs: Sequence[ScanPair], folds: int) -> list[int]:
 def fit_all_boosters(
     model: JointScanCRF, lessons: Sequence[Lesson], config: LearningConfig, generator: torch.Generator
 ) -> dict[int, Boosters]:
-    """The model's boosters, fitted on all pairs, and by fold those fitted on the other folds (margins of unseen pairs, spec 2.5)."""
+    """Fits the model's boosters on all pairs; returns by fold those of the other folds (margins of unseen pairs, spec 2.5)."""
 
     def fit_on(part: Sequence[Lesson]) -> Boosters:
         return fit_boosters(

@@ -161,7 +161,8 @@ def label_hypotheses(hypotheses: Hypotheses, source: Surface, body: Tensor, moti
     """(H,) 1: moves mostly one true mover, and as it moved; 0: neither; -1: between, a mover that hardly moved, or not annotated.
 
     Args:
-        body: (P,) true cluster of every point, -1 none, `IGNORED`. motions: (K+1, 3) of every cluster, NaN where unknown. unit: () metres.
+        body: (P,) true cluster of every point, -1 none, `IGNORED`. motions: (K+1, 3) of every cluster, NaN where unknown.
+        unit: () metres.
     """
     if not len(hypotheses):
         return torch.zeros(0, dtype=torch.int64)

@@ -61,6 +61,6 @@ def fill_spare_slots(plugins: PlugIns, start: Start, stands_for: Tensor) -> Plug
 
 
 def mix_associations(plugins: PlugIns, predicted: Tensor, share: float, generator: torch.Generator) -> PlugIns:
-    """Predicted (B, N) associations in place of the true ones for a share of the pairs: else C3 and C4 separate perfectly (A-28)."""
+    """Predicted (B, N) associations for a share of the pairs: with the true ones C3 and C4 separate perfectly (A-28)."""
     chosen = torch.rand(len(predicted), generator=generator).to(predicted.device) < share
     return replace(plugins, association=torch.where(chosen[:, None], predicted, plugins.association))

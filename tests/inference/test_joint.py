@@ -1,0 +1,452 @@
+"""The sweep schedule on scenes small enough to enumerate: exact chains, batches, slots, and scans with little or nothing in them."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import oracles
+import pytest
+import torch
+from support import assert_close, generator, make_points, normal
+from torch import Tensor
+
+from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.features.potentials import Boosters, PairView
+from torchcrf_scan.features.scales import Scales
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference import joint
+from torchcrf_scan.inference.initialise import Start, nearest_association
+from torchcrf_scan.inference.joint import Parameters
+from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
+from torchcrf_scan.scan import Scan, ScanPair
+
+MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3], [0.2, -0.2, -1.0]], dtype=torch.float64)
+MODEL = JointScanCRF().double()
+CASES = ("all outliers", "empty source", "empty target", "one point", "duplicates", "background only")
+
+
+def make_batch(source: Tensor, target: Tensor, lengths: tuple[list[int], list[int]] | None = None) -> ScanPairBatch:
+    """source: (B, N, 2), target: (B, M, 2); lengths: how many of each scan's points are real."""
+    B, N, M = len(source), source.shape[1], target.shape[1]
+    n, m = (torch.tensor(count)[:, None] for count in lengths or ([N] * B, [M] * B))
+    source_mask, target_mask = torch.arange(N) < n, torch.arange(M) < m
+    return ScanPairBatch(
+        source=source * source_mask[..., None],
+        target=target * target_mask[..., None],
+        source_mask=source_mask,
+        target_mask=target_mask,
+        source_closed=torch.zeros(B, dtype=torch.bool),
+        target_closed=torch.zeros(B, dtype=torch.bool),
+        dt=torch.full((B,), 0.1).to(source),
+        range_noise=torch.full((B,), 0.01).to(source),
+        initial_motion=torch.zeros(B, 3).to(source),
+    )
+
+
+def make_start(batch: ScanPairBatch, motions: Tensor, association: Tensor | None = None, active: Tensor | None = None) -> Start:
+    """motions: (C, 3), the same for every pair; tangents point across the beam."""
+    B, C = len(batch), len(motions)
+    motions = motions.to(batch.source).expand(B, C, 3)
+    active = torch.ones(B, C, dtype=torch.bool) if active is None else active.expand(B, C)
+    if association is None:
+        association = nearest_association(batch, motions, active, gate=20.0)
+    across = torch.stack([-batch.target[..., 1], batch.target[..., 0]], dim=-1)
+    return Start(motions, active, association, torch.nn.functional.normalize(across, dim=-1))
+
+
+def scene(n: int = 24, movers: int = 2, seed: int = 1) -> tuple[ScanPairBatch, Tensor]:
+    """One pair whose points form runs that move as MOTIONS says, a little noisy, and the clusters of its points."""
+    source = make_points(n, seed)
+    cluster = torch.arange(n) * (2 * movers + 1) // n  # background and movers in turn
+    cluster = torch.where(cluster % 2 == 1, (cluster + 1) // 2, 0)
+    target = se2.apply(MOTIONS[cluster], source[:, None])[:, 0] + 0.005 * normal(n, 2, seed=seed)
+    return make_batch(source[None], target[None]), cluster
+
+
+def random_parameters(seed: int) -> Parameters:
+    return Parameters(normal(18, seed=seed), normal(12, seed=seed + 1), Scales().double(), Boosters(1).double())
+
+
+def config(chains: str = "joint", **inference: object) -> ModelConfig:
+    return ModelConfig(chains=chains, inference=InferenceConfig(**inference))  # type: ignore[arg-type]
+
+
+def decode(batch: ScanPairBatch, start: Start, settings: ModelConfig | None = None, parameters: Parameters | None = None) -> Prediction:
+    with torch.no_grad():
+        return joint.decode(PairView.of(batch), start, parameters or MODEL.fitted, settings or config())
+
+
+def part_of(batch: ScanPairBatch, start: Start, b: int) -> tuple[ScanPairBatch, Start]:
+    """Pair b without its padding."""
+    n, m = int(batch.source_mask[b].sum()), int(batch.target_mask[b].sum())
+    alone = batch[b : b + 1]
+    cut = {"source": n, "source_mask": n, "target": m, "target_mask": m}
+    alone = replace(alone, **{name: getattr(alone, name)[:, :length] for name, length in cut.items()})
+    here = slice(b, b + 1)
+    return alone, Start(start.motions[here], start.active[here], start.association[here, :n], start.target_tangents[here, :m])
+
+
+def assert_same(found: Prediction, expected: Prediction, b: int, n: int) -> None:
+    """Pair b of `found` is the only pair of `expected`, n points long."""
+    assert found.association[b, :n].tolist() == expected.association[0].tolist()
+    assert found.cluster[b, :n].tolist() == expected.cluster[0].tolist()
+    assert_close(found.motions[b], expected.motions[0])
+    assert_close(found.log_cluster[b, :n], expected.log_cluster[0])
+    for name in ("active", "converged", "iterations"):
+        assert torch.equal(getattr(found, name)[b], getattr(expected, name)[0]), name
+
+
+def assert_sane(found: Prediction, batch: ScanPairBatch) -> None:
+    """Finite motions, no NaN, labels that exist, beliefs that sum to one."""
+    assert found.motions.isfinite().all()
+    assert not found.log_association.isnan().any()
+    assert not found.log_cluster.isnan().any()
+    assert found.active[:, 0].all()
+    for log in (found.log_association, found.log_cluster):
+        assert_close(log[batch.source_mask].exp().sum(-1), torch.ones(int(batch.source_mask.sum())).double())
+    assert (found.association[~batch.source_mask] == -1).all()
+    assert (found.cluster[~batch.source_mask] == -1).all()
+    assert (found.association < batch.target_mask.sum(-1, keepdim=True)).all()
+    chosen = found.active.gather(1, found.cluster.clamp(min=0))
+    assert (chosen | (found.cluster < 0)).all()
+
+
+# --- exactness ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_clustering_chain_equals_brute_force(seed: int, temperature: float) -> None:
+    source, target = make_points(6, seed), make_points(5, seed + 20)
+    batch, parameters = make_batch(source[None], target[None]), random_parameters(seed)
+    association = torch.randint(-1, 5, (1, 6), generator=generator(seed))
+    active = torch.tensor([True, True, seed % 2 == 0])
+    found = decode(
+        batch,
+        make_start(batch, MOTIONS, association, active),
+        config("clustering", clusters=4, iterations=1, temperature=temperature),
+        parameters,
+    )
+    scales, weights = parameters.scales, parameters.clustering.numpy()
+    arrays = source.numpy(), target.numpy(), MOTIONS.numpy()
+    labels = association[0].tolist()
+    local = oracles.local_clustering(*arrays, active.tolist(), labels, float(scales.cluster_distance), float(scales.outlier_threshold))
+    pairwise = oracles.pairwise_clustering(*arrays, labels, float(scales.neighbour_weight), float(scales.neighbour_distance))
+    unary = local @ weights[:4]
+    unary[:, :3][:, ~active.numpy()] = -np.inf
+    assert_close(found.log_cluster[0], oracles.log_marginals(unary, pairwise @ weights[4:], temperature))
+    if temperature == 0:
+        best = oracles.best_labelling(unary, pairwise @ weights[4:])
+        assert tuple(found.cluster[0].tolist()) == tuple(-1 if k == 3 else k for k in best)
+    assert found.association[0].tolist() == labels
+
+
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_association_chain_equals_brute_force(seed: int, temperature: float) -> None:
+    source, target = make_points(5, seed), make_points(4, seed + 20)
+    batch, parameters = make_batch(source[None], target[None]), random_parameters(seed)
+    settings = config("matching", candidates=0, iterations=1, temperature=temperature)
+    found = decode(batch, make_start(batch, MOTIONS[:1]), settings, parameters)
+    scales, weights = parameters.scales, parameters.association.numpy()
+    moved = se2.apply(MOTIONS[0], source).numpy()
+    local = oracles.local_association(source.numpy(), target.numpy(), scales.local.tolist(), [0.0, 0.0, 0.0], moved)
+    outlier = np.broadcast_to(scales.local_outlier.numpy(), (5, 1, 12))
+    unary = np.concatenate([local, outlier], axis=1) @ weights[:12]  # without boosters their two channels are zero
+    pairwise = oracles.pairwise_association(source.numpy(), target.numpy(), scales.pairwise.tolist(), scales.pairwise_outlier.tolist())
+    assert_close(found.log_association[0], oracles.log_marginals(unary, pairwise @ weights[14:], temperature))
+    if temperature == 0:
+        best = oracles.best_labelling(unary, pairwise @ weights[14:])
+        assert tuple(found.association[0].tolist()) == tuple(-1 if j == 4 else j for j in best)
+
+
+def test_a_clean_scene_is_solved() -> None:
+    batch, cluster = scene(40)
+    start = make_start(batch, MOTIONS + torch.tensor([0.01, 0.05, -0.05]))
+    found = decode(batch, start, config(clusters=4))
+    assert found.association[0].tolist() == list(range(40))
+    assert found.cluster[0].tolist() == cluster.tolist()
+    assert bool(found.converged)
+    members = torch.stack([cluster == k for k in range(3)])  # (C, N)
+    apart = torch.linalg.vector_norm(se2.apply(found.motions[0], batch.source) - se2.apply(MOTIONS, batch.source), dim=-1)
+    assert float(apart[members].max()) < 0.03
+
+
+@pytest.mark.parametrize("metric", ["point", "line"])
+def test_marginals_sum_to_one_and_labels_are_their_best(metric: str) -> None:
+    batch, _ = scene(20)
+    found = decode(batch, make_start(batch, MOTIONS), config(clusters=4, temperature=1.0, motion_metric=metric))
+    assert_sane(found, batch)
+    states = torch.cat([found.candidates, torch.full_like(found.candidates[..., :1], -1)], dim=-1)
+    assert torch.equal(states.gather(-1, found.log_association.argmax(-1, keepdim=True))[..., 0], found.association)
+    best = found.log_cluster.argmax(-1)
+    assert torch.equal(torch.where(best == 3, -1, best), found.cluster)
+
+
+def test_all_candidates_are_the_dense_model() -> None:
+    batch, _ = scene(16)
+    start = make_start(batch, MOTIONS)
+    dense, every = (decode(batch, start, config(clusters=4, candidates=count, temperature=1.0)) for count in (0, 16))
+    for f in fields(Prediction):
+        assert torch.equal(getattr(dense, f.name), getattr(every, f.name)), f.name
+
+
+def test_all_real_candidates_are_the_dense_model_in_a_padded_batch() -> None:
+    batch, _ = scene(16)
+    padded = make_batch(*(torch.nn.functional.pad(points, (0, 0, 0, 4)) for points in (batch.source, batch.target)), ([16], [16]))
+    start = make_start(padded, MOTIONS)
+    dense, every = (decode(padded, start, config(clusters=4, candidates=count, temperature=1.0)) for count in (0, 16))
+    assert every.candidates.shape[-1] == 16
+    assert torch.equal(dense.association, every.association)
+    assert torch.equal(dense.cluster, every.cluster)
+    assert_close(every.motions, dense.motions)
+    assert_close(every.log_association[:, :16, :16], dense.log_association[:, :16, :16])
+    assert_close(every.log_association[:, :16, -1], dense.log_association[:, :16, -1])
+
+
+# --- batches ------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def simulated() -> tuple[ScanPairBatch, Start]:
+    """Four simulated pairs of different sizes, started near the truth."""
+    pairs = [simulate_pairs(SimulatorConfig(beams=beams), 1, 1, seed)[0] for seed, beams in enumerate((41, 61, 51, 33))]
+    batch = ScanPairBatch.collate(pairs, torch.float64)
+    assert batch.truth is not None
+    known = batch.truth.motions.isfinite().all(-1)
+    motions = batch.truth.motions.nan_to_num() + 0.02 * normal(*batch.truth.motions.shape)
+    across = torch.stack([-batch.target[..., 1], batch.target[..., 0]], dim=-1)
+    tangents = torch.nn.functional.normalize(across, dim=-1)
+    return batch.without_truth(), Start(motions, known, nearest_association(batch, motions, known), tangents)
+
+
+@pytest.mark.parametrize("chains", ["joint", "matching", "clustering"])
+@pytest.mark.parametrize("settings", [{}, {"temperature": 1.0, "motion_weights": "soft"}, {"motion_metric": "point", "candidates": 0}])
+def test_every_pair_is_decoded_as_if_alone(simulated: tuple[ScanPairBatch, Start], settings: dict[str, object], chains: str) -> None:
+    batch, start = simulated
+    if chains == "matching":
+        start = start.background_alone()
+    model = config(chains, clusters=start.motions.shape[1] + 1, **settings)
+    together = decode(batch, start, model)
+    for b in range(len(batch)):
+        alone, own_start = part_of(batch, start, b)
+        assert_same(together, decode(alone, own_start, model), b, alone.source.shape[1])
+
+
+def test_what_lies_in_the_padding_is_never_read(simulated: tuple[ScanPairBatch, Start]) -> None:
+    batch, start = simulated
+    rubbish = replace(
+        batch,
+        source=torch.where(batch.source_mask[..., None], batch.source, 7.7),
+        target=torch.where(batch.target_mask[..., None], batch.target, -3.3),
+    )
+    model = config(clusters=start.motions.shape[1] + 1)
+    clean, dirty = decode(batch, start, model), decode(rubbish, start, model)
+    assert torch.equal(clean.association, dirty.association)
+    assert torch.equal(clean.cluster, dirty.cluster)
+    assert_close(dirty.motions, clean.motions)
+
+
+def test_settled_pairs_are_frozen(simulated: tuple[ScanPairBatch, Start]) -> None:
+    batch, start = simulated
+    clusters = start.motions.shape[1] + 1
+    whole = decode(batch, start, config(clusters=clusters, iterations=12))
+    assert whole.converged.any()
+    for b in whole.converged.nonzero()[:, 0].tolist():
+        cut = decode(batch, start, config(clusters=clusters, iterations=int(whole.iterations[b])))
+        assert bool(cut.converged[b])
+        for name in ("association", "cluster", "motions", "log_association", "log_cluster"):
+            assert torch.equal(getattr(cut, name)[b], getattr(whole, name)[b]), name
+
+
+def test_settled_is_what_another_round_would_not_change() -> None:
+    batch, _ = scene(24)
+    first = decode(batch, make_start(batch, MOTIONS), config(clusters=4, iterations=20))
+    assert bool(first.converged)
+    start = make_start(batch, first.motions[0], first.association, first.active)
+    again = decode(batch, start, config(clusters=4, iterations=20))
+    assert torch.equal(again.association, first.association)
+    assert torch.equal(again.cluster, first.cluster)
+    assert_close(again.motions, first.motions, tolerance=1e-3)
+
+
+@pytest.mark.parametrize("iterations", [1, 4, 7])
+def test_without_an_early_stop_every_round_is_done(iterations: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rounds = []
+    step = joint.step
+
+    def counted(*arguments: object) -> joint.State:
+        rounds.append(1)
+        return step(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(joint, "step", counted)
+    batch, _ = scene(16)
+    found = decode(batch, make_start(batch, MOTIONS), config(clusters=4, iterations=iterations, stop_early=False))
+    assert len(rounds) == iterations
+    assert found.iterations.tolist() == [iterations]
+
+
+def test_early_stop_saves_rounds() -> None:
+    batch, _ = scene(16)
+    found = decode(batch, make_start(batch, MOTIONS), config(clusters=4, iterations=30))
+    assert 1 < int(found.iterations) < 30
+
+
+def test_a_swing_is_halved() -> None:
+    batch, _ = scene(6)
+    state = joint.first_state(PairView.of(batch), make_start(batch, MOTIONS), MODEL.fitted, InferenceConfig(clusters=4))
+    apart = replace(state, association=state.association.roll(1, -1))
+
+    def at(of: joint.State, motions: Tensor) -> joint.State:
+        return replace(of, motions=replace(of.motions, value=motions[None]))
+
+    older, before, after = at(state, MOTIONS), at(apart, MOTIONS + 1), at(state, MOTIONS + 2)
+    assert_close(joint.damp(after, before, older).motions.value[0], MOTIONS + 1.5)
+    onward = joint.damp(at(apart, MOTIONS + 2), before, older)
+    assert_close(onward.motions.value[0], MOTIONS + 2)
+
+
+# --- slots of the movers ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("settings", [{}, {"temperature": 1.0, "motion_weights": "soft"}])
+def test_the_order_of_the_movers_does_not_matter(settings: dict[str, object]) -> None:
+    batch, _ = scene(24)
+    order = [0, 2, 1, 3]  # a slot stays empty
+    motions, active = torch.cat([MOTIONS, MOTIONS[:1] + 5]), torch.tensor([True, True, True, False])
+    one = decode(batch, make_start(batch, motions, active=active), config(clusters=5, **settings))
+    other = decode(batch, make_start(batch, motions[order], active=active[order]), config(clusters=5, **settings))
+    assert_close(other.motions, one.motions[:, order])
+    assert torch.equal(other.active, one.active[:, order])
+    assert_close(other.log_cluster, one.log_cluster[..., [*order, 4]])
+    assert_close(other.log_association, one.log_association)
+    assert torch.equal(other.association, one.association)
+    slot_of = torch.tensor([*order, -1])  # the permutation is its own inverse
+    assert torch.equal(other.cluster, slot_of[one.cluster])
+
+
+def test_a_slot_that_does_not_exist_is_never_taken() -> None:
+    batch, _ = scene(24)
+    active = torch.tensor([True, False, True])
+    found = decode(batch, make_start(batch, MOTIONS, active=active), config(clusters=4, temperature=1.0))
+    assert_sane(found, batch)
+    assert (found.log_cluster[..., 1] == -torch.inf).all()
+    assert not (found.cluster == 1).any()
+    assert not bool(found.active[0, 1])
+
+
+def test_an_empty_cluster_keeps_its_slot_for_two_rounds() -> None:
+    batch, _ = scene(16, movers=0)
+    nowhere = torch.cat([MOTIONS[:1], MOTIONS[:1] + torch.tensor([0.0, 50.0, 50.0])])
+    start = make_start(batch, nowhere)
+    settings = {"clusters": 3, "stop_early": False}
+    after = [decode(batch, start, config(iterations=rounds, **settings)) for rounds in (1, 2)]
+    assert not (after[0].cluster == 1).any()
+    assert after[0].active.tolist() == [[True, True]]
+    assert after[1].active.tolist() == [[True, False]]
+    assert_close(after[1].motions[0, 1], nowhere[1])
+
+
+def test_more_movers_than_slots() -> None:
+    batch, _ = scene(30, movers=2)
+    found = decode(batch, make_start(batch, MOTIONS[:2]), config(clusters=3))
+    assert_sane(found, batch)
+    assert set(found.cluster[0].tolist()) <= {-1, 0, 1}
+
+
+# --- scans with little in them ------------------------------------------------------------------------------------------------
+
+
+def poor_scene(name: str) -> tuple[ScanPairBatch, Start]:
+    source, target = make_points(7, 1)[None], make_points(6, 2)[None]
+    lengths = {"empty source": ([0], [6]), "empty target": ([7], [0]), "one point": ([1], [1])}.get(name, ([7], [6]))
+    if name == "duplicates":
+        source, target = source[:, :1].expand(1, 7, 2), source[:, :1].expand(1, 6, 2)
+    batch = make_batch(source, target, lengths)
+    nobody = torch.full((1, 7), -1)
+    association = nobody if name == "all outliers" else None
+    motions = MOTIONS[:1] if name == "background only" else MOTIONS
+    if name == "all outliers":
+        motions = motions + torch.tensor([0.0, 500.0, 500.0])
+    start = make_start(batch, motions, association)
+    return batch, start
+
+
+@pytest.mark.parametrize("chains", ["joint", "matching", "clustering"])
+@pytest.mark.parametrize("settings", [{}, {"temperature": 1.0, "motion_weights": "soft", "candidates": 0}])
+@pytest.mark.parametrize("name", CASES)
+def test_there_is_an_answer_whatever_the_scans(name: str, settings: dict[str, object], chains: str) -> None:
+    batch, start = poor_scene(name)
+    if chains == "matching":
+        start = start.background_alone()
+    for metric in ("point", "line"):
+        model = config(chains, clusters=start.motions.shape[1] + 1, motion_metric=metric, **settings)
+        found = decode(batch, start, model)
+        assert_sane(found, batch)
+        if name == "all outliers":
+            assert (found.association == -1).all()
+            assert_close(found.motions[:, 0], start.motions[:, 0])
+
+
+def test_a_poor_pair_does_not_disturb_its_neighbour() -> None:
+    batch, _ = scene(12)
+    both = make_batch(batch.source.repeat(2, 1, 1), batch.target.repeat(2, 1, 1), ([12, 0], [12, 0]))
+    alone, together = (decode(b, make_start(b, MOTIONS), config(clusters=4)) for b in (batch, both))
+    assert_same(together, alone, 0, 12)
+
+
+# --- one chain alone ----------------------------------------------------------------------------------------------------------
+
+
+def test_matching_has_one_motion_and_calls_every_associated_point_background() -> None:
+    batch, cluster = scene(30, movers=1)
+    found = decode(batch, make_start(batch, MOTIONS[:1]), config("matching"))
+    assert found.motions.shape == (1, 1, 3)
+    assert found.log_cluster.shape == (1, 30, 2)
+    assert torch.equal(found.cluster, torch.where(found.association >= 0, 0, -1))
+    inlier = found.log_association[..., :-1].exp().sum(-1)
+    assert_close(found.log_cluster[..., 0].exp(), inlier)
+    still = cluster == 0
+    assert (found.association[0, still] == torch.arange(30)[still]).float().mean() > 0.9
+
+
+def test_matching_layer_has_eighteen_weights_in_use() -> None:
+    model = MatchingCRF().double()
+    batch, _ = scene(12)
+    found = model(batch, make_start(batch, MOTIONS[:1]))
+    found.log_association[found.log_association > -torch.inf].sum().backward()
+    used = [name for name, weight in model.named_parameters() if weight.grad is not None and float(weight.grad.abs()) > 0]
+    assert all(name.startswith("association_weights") for name in used)
+    assert "association_weights.registered_translation" in used
+
+
+def test_clustering_keeps_the_associations_that_it_is_given() -> None:
+    batch, cluster = scene(30)
+    association = torch.arange(30)[None].clone()
+    association[0, 4] = -1
+    found = ClusteringCRF(config(clusters=4)).double()(batch, make_start(batch, MOTIONS, association))
+    assert torch.equal(found.association, association)
+    right = found.cluster[0] == cluster
+    assert right[torch.arange(30) != 4].all()
+
+
+@pytest.mark.parametrize("weights", ["hard", "soft"])
+def test_clustering_believes_the_associations_that_it_is_given(weights: str) -> None:
+    batch, _ = scene(12, movers=0)
+    association = torch.arange(12)[None].roll(3, -1)  # not among the two nearest
+    settings = config("clustering", clusters=2, candidates=2, iterations=1, motion_weights=weights, temperature=1.0)
+    found = decode(batch, make_start(batch, MOTIONS[:1], association), settings)
+    assert torch.equal(found.association, association)
+    states = torch.cat([found.candidates, torch.full_like(found.candidates[..., :1], -1)], dim=-1)
+    believed = states.gather(-1, found.log_association.argmax(-1, keepdim=True))[..., 0]
+    assert torch.equal(believed, association)
+
+
+def test_a_scan_pair_without_returns_is_matched() -> None:
+    bearings = np.linspace(-1.0, 1.0, 9)
+    silent, wall = Scan.from_ranges(np.full(9, np.inf), bearings), Scan.from_ranges(np.full(9, 4.0), bearings)
+    for pair in (ScanPair(silent, wall), ScanPair(wall, silent), ScanPair(silent, silent)):
+        found = JointScanCRF().match_pairs([pair])[0]
+        assert (found.association == -1).all()
+        assert np.isfinite(found.motions).all()
