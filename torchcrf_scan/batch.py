@@ -75,6 +75,19 @@ class ScanPairBatch:
         truth = self.truth and Truth(*(getattr(self.truth, f.name)[index] for f in fields(self.truth)))
         return ScanPairBatch(**part, truth=truth)
 
+    def scaled(self, factor: Tensor) -> ScanPairBatch:
+        """The same scenes in another unit of length, a factor (B,) a pair."""
+        by_pair = factor[:, None, None]
+        truth = self.truth and replace(self.truth, motions=scale_motions(self.truth.motions, factor))
+        return replace(
+            self,
+            source=self.source * by_pair,
+            target=self.target * by_pair,
+            range_noise=self.range_noise * factor,
+            initial_motion=scale_motions(self.initial_motion, factor),
+            truth=truth,
+        )
+
     def without_truth(self) -> ScanPairBatch:
         """The batch as a user brings it, without annotation."""
         return replace(self, truth=None)
@@ -98,6 +111,12 @@ class ScanPairBatch:
             initial_motion=torch.zeros(len(pairs), 3, dtype=dtype),
             truth=_collate_truth(pairs, source_mask, dtype) if all(pair.annotation for pair in pairs) else None,
         )
+
+
+def scale_motions(motions: Tensor, factor: Tensor) -> Tensor:
+    """(B, ..., 3) motions in another unit of length, a factor (B,) a pair."""
+    by_pair = factor.view(-1, *[1] * (motions.dim() - 1))
+    return torch.cat([motions[..., :1], motions[..., 1:] * by_pair], dim=-1)
 
 
 def _pad_points(scans: Sequence[Scan]) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS, Scales
@@ -84,7 +84,7 @@ class JointScanCRF(nn.Module):
 
     def view(self, batch: ScanPairBatch) -> PairView:
         """What the features need of a batch, computed once."""
-        return PairView.of(batch, self.config.features.wrap_closed)
+        return PairView.of(batch, self.config.features.wrap_closed, self.config.features.length_unit)
 
     def initialise(self, batch: ScanPairBatch) -> Start:
         """InitialiseRT: the motions to begin with (Algorithm 1, line 1). No gradient."""
@@ -94,7 +94,8 @@ class JointScanCRF(nn.Module):
         found = initialise(batch, self.scales, self.hypothesis_score, clusters)
         if self.config.start == "search":
             return found
-        return paper_start(self.view(batch), found, self.fitted, self.config.inference)
+        view = self.view(batch)
+        return paper_start(view, found.scaled(view.factor), self.fitted, self.config.inference).scaled(1 / view.factor)
 
     def forward(self, batch: ScanPairBatch, start: Start | None = None) -> Prediction:
         """Labels, motions and log-beliefs of every pair.
@@ -105,19 +106,19 @@ class JointScanCRF(nn.Module):
         """
         start = start or self.initialise(batch)
         view = self.view(batch)
-        if self.config.inference.schedule == "flooding":
-            return flooding.decode(view, start, self.fitted, self.config)
-        return joint.decode(view, start, self.fitted, self.config)
+        schedule = {"sweep": joint.decode, "flooding": flooding.decode}[self.config.inference.schedule]
+        prediction = schedule(view, start.scaled(view.factor), self.fitted, self.config)
+        return replace(prediction, motions=scale_motions(prediction.motions, 1 / view.factor))
 
     def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
         """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.
 
-        plugins: motions and labels taken as observed in the features; the true ones where absent.
+        plugins: motions and labels taken as observed in the features, in the unit of `view`; the true ones where absent.
         """
         if batch.truth is None:
             raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
         view = self.view(batch)
-        plugins = plugins or pseudo_likelihood.true_plugins(batch, self.config.inference.clusters - 1)
+        plugins = plugins or pseudo_likelihood.true_plugins(view.batch, self.config.inference.clusters - 1)
         return pseudo_likelihood.pseudo_log_likelihood(view, plugins, self.fitted, self.config)
 
     @torch.no_grad()

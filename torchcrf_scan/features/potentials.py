@@ -11,10 +11,11 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.features import association
 from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.features.scales import LOCAL_CHANNELS, STATIC_CHANNELS, Scales
-from torchcrf_scan.features.shape import ShapeDescriptors, describe
+from torchcrf_scan.features.shape import ShapeDescriptors, describe, local_spacing
 from torchcrf_scan.geometry import se2
 
 OUTLIER_INPUTS = len(LOCAL_CHANNELS) + 2
+REFERENCE_UNIT = 0.1  # metres; the resolution of a street scanner, so that scales keep their usual size in the unit `spacing`
 
 
 class Boosters(nn.Module):
@@ -28,19 +29,42 @@ class Boosters(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class PairView:
-    """A batch and the descriptors of its scans: what does not depend on motions or candidates."""
+    """A batch and the descriptors of its scans: what does not depend on motions or candidates.
+
+    Attributes:
+        batch: the pairs in the unit of length that features are measured in.
+        factor: (B,) that unit's factor on metres.
+    """
 
     batch: ScanPairBatch
     source_shape: ShapeDescriptors
     target_shape: ShapeDescriptors
+    factor: Tensor
 
     @classmethod
-    def of(cls, batch: ScanPairBatch, wrap_closed: bool = True) -> PairView:
-        """wrap_closed: neighbours wrap on a closed scan (A-06); off, they clamp as in the paper."""
-        closed = [flags & wrap_closed for flags in (batch.source_closed, batch.target_closed)]
-        return cls(
-            batch, describe(batch.source, batch.source_mask, closed[0]), describe(batch.target, batch.target_mask, closed[1])
-        )
+    def of(cls, batch: ScanPairBatch, wrap_closed: bool = True, length_unit: str = "metre") -> PairView:
+        """Describes both scans.
+
+        Args:
+            wrap_closed: neighbours wrap on a closed scan (A-06); off, they clamp as in the paper.
+            length_unit: `metre`, or `spacing`: every pair is measured in what its own scans resolve.
+        """
+        factor = torch.ones_like(batch.dt) if length_unit == "metre" else REFERENCE_UNIT / resolution(batch)
+        batch = batch.scaled(factor)
+        source_closed, target_closed = batch.source_closed & wrap_closed, batch.target_closed & wrap_closed
+        source_shape = describe(batch.source, batch.source_mask, source_closed)
+        return cls(batch, source_shape, describe(batch.target, batch.target_mask, target_closed), factor)
+
+
+@torch.no_grad()
+def resolution(batch: ScanPairBatch) -> Tensor:
+    """(B,) metres: half the usual spacing of a pair's points and twice their noise, the size of an ordinary registration error."""
+    spacing = []
+    for points, mask in ((batch.source, batch.source_mask), (batch.target, batch.target_mask)):
+        open_ended = torch.zeros_like(batch.source_closed)
+        spacing.append(local_spacing(describe(points, mask, open_ended)).masked_fill(~mask, torch.nan))
+    usual = torch.cat(spacing, dim=1).nanmedian(-1).values.nan_to_num(nan=0.1)
+    return usual / 2 + 2 * batch.range_noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,12 +137,22 @@ def association_potentials(unary: Tensor, pairwise: Tensor, mask: Tensor, weight
     return log_unary, pairwise @ weights[14:]
 
 
-def clustering_potentials(local: Tensor, pairwise: Tensor, active: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Log potentials (B, N, D) and (B, N-1, D, D) of the clustering chain; inactive clusters are impossible (spec 7.5).
+def possible_clusters(active: Tensor, reach: Tensor | None, points: int) -> Tensor:
+    """(B, N, D) states of the clustering chain that are not ruled out; the outlier never is.
+
+    active: (B, C). reach: (B, N, C) clusters that a point is near enough to, None: all. points: N.
+    """
+    inliers = active[:, None].expand(-1, points, -1)
+    if reach is not None:
+        inliers = inliers & reach
+    return torch.cat([inliers, inliers.new_ones(*inliers.shape[:2], 1)], dim=-1)
+
+
+def clustering_potentials(local: Tensor, pairwise: Tensor, possible: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Log potentials (B, N, D) and (B, N-1, D, D) of the clustering chain (spec 7.5: inactive clusters are impossible).
 
     Args:
-        local: (B, N, D, 4). pairwise: (B, N-1, D, D, 8). active: (B, D-1). weights: (12,).
+        local: (B, N, D, 4). pairwise: (B, N-1, D, D, 8). possible: (B, N, D) bool. weights: (12,).
     """
-    possible = torch.cat([active, active.new_ones(len(active), 1)], dim=-1)
-    log_unary = (local @ weights[:4]).masked_fill(~possible[:, None], -torch.inf)
+    log_unary = (local @ weights[:4]).masked_fill(~possible, -torch.inf)
     return log_unary, pairwise @ weights[4:]

@@ -23,6 +23,7 @@ from torchcrf_scan.features.potentials import (
     association_potentials,
     association_unary,
     clustering_potentials,
+    possible_clusters,
     registered_points,
     state_mask,
 )
@@ -68,7 +69,7 @@ class Flooding:
     """The moving parts of one run: state, messages of both chains, running sums of every cluster."""
 
     def __init__(self, view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> None:
-        self.view, self.parameters, self.model = view, parameters, model
+        self.view, self.start, self.parameters, self.model = view, start, parameters, model
         self.state = joint.first_state(view, start, parameters, model.inference)
         B, N = view.batch.source.shape[:2]
         self.cluster_messages = Messages.zeros(B, N, self.state.log_cluster.shape[-1], view.batch.source)
@@ -104,7 +105,8 @@ class Flooding:
         )
         local = clustering.local_features(at, state.motions.active, scales)
         pairwise = clustering.pairwise_features(batch.source[:, around], at, scales)
-        unary, edges = clustering_potentials(local, pairwise, state.motions.active, self.parameters.clustering)
+        possible = possible_clusters(state.motions.active, self.start.reach, batch.source.shape[1])[:, around]
+        unary, edges = clustering_potentials(local, pairwise, possible, self.parameters.clustering)
         k = i - around.start
         before = edges[:, k - 1] if k > 0 else None
         after = edges[:, k] if k < edges.shape[1] else None

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.features import candidates
-from torchcrf_scan.features.potentials import PairView
+from torchcrf_scan.batch import ScanPairBatch, scale_motions
+from torchcrf_scan.features.candidates import squared_distances
+from torchcrf_scan.features.potentials import PairView, possible_clusters, resolution
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.background import background_pool, unit_length
@@ -24,6 +24,8 @@ from torchcrf_scan.inference.surface import Surface
 
 FEWEST_POINTS = 3  # a scan with fewer says nothing of the motion
 RANSAC_STARTS = 4
+REACH_EXTENT = 0.5  # of an object's seen extent, and
+REACH_UNITS = 4.0  # units of resolution beyond it may still be the object
 FOOTPRINT = 0.0175  # radians; spacing of a one-degree scanner on a surface that faces it
 
 
@@ -35,16 +37,22 @@ class Start:
         motions: (B, C, 3), active: (B, C).
         association: (B, N) nearest target point under the best motion, -1 where none comes near.
         target_tangents: (B, M, 2) direction of the target's surface at every point, 0 where it has none.
+        reach: (B, N, C) bool, points near enough to the segment that a mover was found by: an object is in one place. None: any.
     """
 
     motions: Tensor
     active: Tensor
     association: Tensor
     target_tangents: Tensor
+    reach: Tensor | None = None
 
     def background_alone(self) -> Start:
         """The start of CRF-Matching, which has one motion."""
-        return replace(self, motions=self.motions[:, :1], active=self.active[:, :1])
+        return replace(self, motions=self.motions[:, :1], active=self.active[:, :1], reach=None)
+
+    def scaled(self, factor: Tensor) -> Start:
+        """The same start in another unit of length, a factor (B,) a pair."""
+        return replace(self, motions=scale_motions(self.motions, factor))
 
 
 @torch.no_grad()
@@ -54,6 +62,7 @@ def initialise(batch: ScanPairBatch, scales: Scales, score: HypothesisScore, clu
     motions = batch.initial_motion[:, None].repeat(1, clusters, 1)
     active = torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
     active[:, 0] = True
+    members = torch.zeros(len(batch), clusters, batch.source.shape[1], dtype=torch.bool, device=motions.device)
     tangents = torch.zeros_like(batch.target)
     for b in range(len(batch)):
         n, m = int(batch.source_mask[b].sum()), int(batch.target_mask[b].sum())
@@ -61,28 +70,57 @@ def initialise(batch: ScanPairBatch, scales: Scales, score: HypothesisScore, clu
             continue
         source = Surface.of(batch.source[b, :n], batch.range_noise[b], bool(batch.source_closed[b]))
         target = Surface.of(batch.target[b, :m], batch.range_noise[b], bool(batch.target_closed[b]))
-        found = start_pair(source, target, batch.initial_motion[b], shape_matches[b, :n], float(batch.dt[b]), score, clusters - 1)
-        motions[b, : len(found)], active[b, : len(found)] = found, True
+        background = find_background(source, target, batch.initial_motion[b], shape_matches[b, :n])
+        found = find_movers(source, target, background, float(batch.dt[b]), score, most=clusters - 1)
+        slots = slice(1, 1 + len(found.motions))
+        motions[b, 0], motions[b, slots], active[b, slots] = background, found.motions, True
+        members[b, slots, :n] = found.members
         tangents[b, :m] = target.tangent
-    return Start(motions, active, nearest_association(batch, motions, active), tangents)
+    reach = within_reach(batch.source, members, resolution(batch))
+    return Start(motions, active, nearest_association(batch, motions, active, reach), tangents, reach)
 
 
-def start_pair(
-    source: Surface, target: Surface, guess: Tensor, match: Tensor, dt: float, score: HypothesisScore, most: int
-) -> Tensor:
-    """(1 + G, 3) motions of one pair's background and movers. guess: (3,); match: (P,) shape associations, -1 none."""
+def find_background(source: Surface, target: Surface, guess: Tensor, match: Tensor) -> Tensor:
+    """(3,) the background's motion. guess: (3,); match: (P,) shape associations, -1 none."""
     matched = match >= 0
-    unit = unit_length(source, target)
-    ransac = ransac_motions(source.points[matched], target.points[match[matched]], 3 * unit, RANSAC_STARTS)
-    background = background_pool(source, target, guess, ransac)[0]
-    return torch.cat([background[None], find_movers(source, target, background, dt, score, most=most).motions])
+    gate = 3 * unit_length(source, target)
+    ransac = ransac_motions(source.points[matched], target.points[match[matched]], gate, RANSAC_STARTS)
+    return background_pool(source, target, guess, ransac)[0]
 
 
-def nearest_association(batch: ScanPairBatch, motions: Tensor, active: Tensor, gate: float = 3.0) -> Tensor:
-    """(B, N) target point that comes nearest under any active motion, -1 beyond `gate` units of footprint and noise."""
-    moved = se2.apply(motions, batch.source[:, None])  # (B, C, N, 2)
-    distance = candidates.squared_distances(moved, batch.target, batch.target_mask)  # (B, C, N, M)
-    nearest, index = distance.masked_fill(~active[:, :, None, None], torch.inf).amin(1).min(-1)
+def within_reach(points: Tensor, members: Tensor, unit: Tensor) -> Tensor:
+    """Points that may belong to the object some of whose points are known: within half its extent and a few units of them.
+
+    Args:
+        points: (B, N, 2). members: (B, C, N) known points of every cluster. unit: (B,) metres.
+
+    Returns:
+        (B, N, C); everything is in reach of the background.
+    """
+    spread = points[:, None].masked_fill(~members[..., None], torch.nan)  # (B, C, N, 2)
+    low = spread.nan_to_num(nan=torch.inf).amin(2)
+    high = spread.nan_to_num(nan=-torch.inf).amax(2)
+    extent = torch.linalg.vector_norm((high - low).clamp(min=0), dim=-1)  # (B, C)
+    nearest = torch.stack(
+        [squared_distances(points, points, members[:, c]).amin(-1) for c in range(members.shape[1])], dim=-1
+    ).sqrt()  # (B, N, C)
+    reach = nearest <= (REACH_EXTENT * extent + REACH_UNITS * unit[:, None])[:, None]
+    reach[..., 0] = True
+    return reach
+
+
+def nearest_association(
+    batch: ScanPairBatch, motions: Tensor, active: Tensor, reach: Tensor | None = None, gate: float = 3.0
+) -> Tensor:
+    """(B, N) target point that comes nearest under any possible motion, -1 beyond `gate` units of footprint and noise."""
+    possible = possible_clusters(active, reach, batch.source.shape[1])  # (B, N, D)
+    nearest = batch.source.new_full(batch.source.shape[:2], torch.inf)
+    index = torch.zeros_like(nearest, dtype=torch.int64)
+    for c in range(motions.shape[1]):
+        moved = se2.apply(motions[:, c], batch.source)
+        distance, place = squared_distances(moved, batch.target, batch.target_mask).min(-1)
+        nearer = possible[..., c] & (distance < nearest)
+        nearest, index = torch.where(nearer, distance, nearest), torch.where(nearer, place, index)
     footprint = torch.linalg.vector_norm(batch.source, dim=-1) * FOOTPRINT
     unit = footprint / 2 + 2 * batch.range_noise[:, None]
     return index.masked_fill((nearest.sqrt() > gate * unit) | ~batch.source_mask, -1)

@@ -25,6 +25,7 @@ from torchcrf_scan.features.potentials import (
     association_potentials,
     association_unary,
     clustering_potentials,
+    possible_clusters,
     registered_points,
 )
 from torchcrf_scan.features.scales import Scales
@@ -89,7 +90,8 @@ def first_state(view: PairView, start: Start, parameters: Parameters, config: In
     batch = view.batch
     found = find_candidates(view, start.motions, start.active, config)
     at = clustering.correspond(batch.source, batch.target, start.motions, found.nearest, start.association)
-    fit = -at.residual.masked_fill(~start.active[:, None], torch.inf)  # (B, N, C)
+    possible = possible_clusters(start.active, start.reach, batch.source.shape[1])
+    fit = -at.residual.masked_fill(~possible[..., :-1], torch.inf)  # (B, N, C)
     best = fit.argmax(-1)
     outlier = start.association < 0
     log_cluster = torch.cat([fit, torch.full_like(fit[..., :1], -torch.inf)], dim=-1)
@@ -119,7 +121,7 @@ def step(
     """One round: clustering chain, motions, association chain, motions. A chain that is not in `chains` is left out."""
     found = find_candidates(view, state.motions.value, state.motions.active, config)
     if chains != "matching":
-        state = update_clusters(view, state, found, parameters, config)
+        state = update_clusters(view, start, state, found, parameters, config)
         state = update_motions(view, start, state, parameters, config)
     if chains != "clustering":
         state = update_association(view, state, found, parameters, config)
@@ -136,13 +138,16 @@ def inliers_are_background(state: State) -> State:
     return replace(state, cluster=torch.where(state.association >= 0, 0, -1), log_cluster=log_cluster)
 
 
-def update_clusters(view: PairView, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig) -> State:
+def update_clusters(
+    view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig
+) -> State:
     """An exact pass over the clustering chain, motions and associations plugged in."""
     batch, scales = view.batch, parameters.scales
     at = clustering.correspond(batch.source, batch.target, state.motions.value, found.nearest, state.association)
     local = clustering.local_features(at, state.motions.active, scales)
     pairwise = clustering.pairwise_features(batch.source, at, scales)
-    potentials = clustering_potentials(local, pairwise, state.motions.active, parameters.clustering)
+    possible = possible_clusters(state.motions.active, start.reach, batch.source.shape[1])
+    potentials = clustering_potentials(local, pairwise, possible, parameters.clustering)
     log_cluster = chain_beliefs(*potentials, batch.source_mask, config.temperature)
     return replace(state, log_cluster=log_cluster, cluster=cluster_labels(log_cluster, batch.source_mask))
 

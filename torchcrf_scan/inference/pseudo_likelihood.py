@@ -21,6 +21,7 @@ from torchcrf_scan.features.potentials import (
     Boosters,
     PairView,
     association_unary,
+    possible_clusters,
     registered_points,
     state_mask,
 )
@@ -38,6 +39,7 @@ class PlugIns:
         cluster: (B, N) hat x_c in the registered channel, -1 outlier (moved with the background).
         label: (B, N) true cluster as a slot of `motions`, -1 outlier.
         known: (B, N) bool, nodes whose labels count.
+        reach: (B, N, C) clusters that a point is near enough to; None: all.
     """
 
     motions: Tensor
@@ -46,6 +48,7 @@ class PlugIns:
     cluster: Tensor
     label: Tensor
     known: Tensor
+    reach: Tensor | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +142,7 @@ def clustering_design(view: PairView, plugins: PlugIns, scales: Scales) -> Desig
     label = torch.where(plugins.label >= 0, plugins.label, C)
     known = plugins.known & batch.source_mask
     features = torch.cat([local, at_true_neighbours(pairwise, label, known)], dim=-1)
-    possible = torch.cat([plugins.active, plugins.active.new_ones(len(label), 1)], dim=-1)
-    return Design(features, possible[:, None].expand(features.shape[:3]), label, known)
+    return Design(features, possible_clusters(plugins.active, plugins.reach, label.shape[1]), label, known)
 
 
 def at_true_neighbours(pairwise: Tensor, label: Tensor, known: Tensor) -> Tensor:
@@ -175,6 +177,11 @@ def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Paramete
 
 def for_background_alone(plugins: PlugIns) -> PlugIns:
     """Every point moves with the background: the plug-ins of CRF-Matching."""
-    label = plugins.label.clamp(max=0)
-    nowhere = torch.zeros_like(plugins.cluster)
-    return replace(plugins, motions=plugins.motions[:, :1], active=plugins.active[:, :1], cluster=nowhere, label=label)
+    return replace(
+        plugins,
+        motions=plugins.motions[:, :1],
+        active=plugins.active[:, :1],
+        cluster=torch.zeros_like(plugins.cluster),
+        label=plugins.label.clamp(max=0),
+        reach=None,
+    )

@@ -93,11 +93,12 @@ def fit(model: JointScanCRF, material: Sequence[Material], config: LearningConfi
 
 def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generator: torch.Generator) -> Lesson:
     """The training plug-ins of one batch; for CRF-Matching every point moves with the background."""
-    plugins = training_plugins(part.batch, part.start, config, generator)
-    start = part.start
+    view = model.view(part.batch)
+    start = part.start.scaled(view.factor)
+    plugins = training_plugins(view.batch, start, config, generator)
     if model.config.chains == "matching":
         plugins, start = pseudo_likelihood.for_background_alone(plugins), start.background_alone()
-    return Lesson(model.view(part.batch), start, plugins, part.fold)
+    return Lesson(view, start, plugins, part.fold)
 
 
 def assign_folds(pairs: Sequence[ScanPair], folds: int) -> list[int]:
@@ -149,7 +150,7 @@ def predict_association(model: JointScanCRF, lesson: Lesson, margins: Boosters) 
     parameters = replace(model.fitted, boosters=margins)
     plugins, config = lesson.plugins, model.config.inference
     with torch.no_grad():
-        start = Start(plugins.motions, plugins.active, lesson.start.association, lesson.start.target_tangents)
+        start = replace(lesson.start, motions=plugins.motions, active=plugins.active, reach=None)
         state = joint.first_state(lesson.view, start, parameters, config)
         one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), plugins.motions.shape[1] + 1).to(plugins.motions)
         state = replace(state, motions=Motions.start(plugins.motions, plugins.active), log_cluster=one_hot)

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import LearningConfig
+from torchcrf_scan.features.potentials import resolution
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.initialise import Start, within_reach
 from torchcrf_scan.inference.pseudo_likelihood import PlugIns, true_plugins
 
 
@@ -28,7 +29,7 @@ def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig,
     found = torch.einsum("bgk,bkc->bgc", stands_for.to(noisy), start.motions)
     take = stands_for.any(-1) & use_start.to(noisy.device)[:, None]
     motions = torch.where(take[..., None], found, noisy)
-    return fill_spare_slots(replace(truth, motions=motions), start, stands_for)
+    return fill_spare_slots(replace(truth, motions=motions), batch, start, stands_for)
 
 
 def match_start(batch: ScanPairBatch, start: Start, truth: PlugIns) -> Tensor:
@@ -48,16 +49,25 @@ def match_start(batch: ScanPairBatch, start: Start, truth: PlugIns) -> Tensor:
     return both & (error < tolerance[..., None])
 
 
-def fill_spare_slots(plugins: PlugIns, start: Start, stands_for: Tensor) -> PlugIns:
+def fill_spare_slots(plugins: PlugIns, batch: ScanPairBatch, start: Start, stands_for: Tensor) -> PlugIns:
     """Puts found movers that stand for nothing into empty slots, so that the weights learn to ignore them."""
     spurious = start.active & ~stands_for.any(1)
     spurious[:, 0] = False  # a wrong background is no mover
     motions, active = plugins.motions.clone(), plugins.active.clone()
+    reach = reach_of_truth(plugins, batch)
     for b in range(len(motions)):
         free, extra = (~active[b]).nonzero()[:, 0], spurious[b].nonzero()[:, 0]
         many = min(len(free), len(extra))
         motions[b, free[:many]], active[b, free[:many]] = start.motions[b, extra[:many]], True
-    return replace(plugins, motions=motions, active=active)
+        if start.reach is not None:
+            reach[b][:, free[:many]] = start.reach[b][:, extra[:many]]
+    return replace(plugins, motions=motions, active=active, reach=None if start.reach is None else reach)
+
+
+def reach_of_truth(plugins: PlugIns, batch: ScanPairBatch) -> Tensor:
+    """(B, N, C) points near enough to the true points of every cluster."""
+    clusters = torch.arange(plugins.motions.shape[1], device=plugins.label.device)
+    return within_reach(batch.source, plugins.label[:, None] == clusters[:, None], resolution(batch))
 
 
 def mix_associations(plugins: PlugIns, predicted: Tensor, share: float, generator: torch.Generator) -> PlugIns:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
 from torchcrf_scan.config import WORLDS, Config, DataConfig
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.simulate import simulate_pairs
@@ -117,7 +117,9 @@ class Cascade:
         matched = self.matching(batch, start.background_alone())
         clusters = self.clustering.config.inference.clusters - 1
         view, fitted = self.clustering.view(batch), self.matching.fitted
-        return movers_from_associations(view, matched.motions[:, 0], matched.association, fitted, clusters, start.target_tangents)
+        background = scale_motions(matched.motions[:, 0], view.factor)
+        fed = movers_from_associations(view, background, matched.association, fitted, clusters, start.target_tangents)
+        return fed.scaled(1 / view.factor)
 
     def __call__(self, batch: ScanPairBatch, start: Start) -> Prediction:
         """Decodes a batch."""
