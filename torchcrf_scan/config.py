@@ -179,6 +179,7 @@ class LearningConfig:
     Attributes:
         rotation_noise: radians of noise on the true motions.
         translation_noise: metres of noise on the true motions.
+        disturbance: units of resolution by which training scans are skewed and bumped, as moving sensors do; 0: as they are.
         start_share: share of the pairs whose features see InitialiseRT's motions instead.
         predicted_share: share of the pairs whose clustering features see predicted associations (A-28).
         folds: parts of the training pairs for out-of-fold margins; sequences stay whole. 0: margins on the same pairs (faithful).
@@ -192,6 +193,7 @@ class LearningConfig:
 
     rotation_noise: float = 0.005
     translation_noise: float = 0.02
+    disturbance: float = 1.0
     start_share: float = 0.5
     predicted_share: float = 0.5
     folds: int = 4

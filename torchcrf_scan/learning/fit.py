@@ -21,6 +21,7 @@ from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.motion import Motions
 from torchcrf_scan.inference.pseudo_likelihood import Design, PlugIns
 from torchcrf_scan.learning.boosting_fit import fit_boosters
+from torchcrf_scan.learning.disturb import disturb
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.scales_fit import fit_scales
 from torchcrf_scan.learning.weights_fit import Watch, fit_weights, flatten
@@ -61,8 +62,11 @@ def gather_material(model: JointScanCRF, pairs: Sequence[ScanPair], config: Lear
     step = config.batch_size
     batches = [(fold, part[k : k + step]) for fold, part in parts.items() for k in range(0, len(part), step)]
     material = []
+    generator = torch.Generator().manual_seed(config.seed)
     for fold, part in tqdm(batches, desc="InitialiseRT", unit="batch", leave=False):
         batch = ScanPairBatch.collate(part)
+        if config.disturbance > 0:
+            batch = disturb(batch, config.disturbance, generator)
         material.append(Material(batch, model.initialise(batch), fold))
     return material
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,14 +17,16 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.background import background_pool, unit_length
 from torchcrf_scan.inference.movers import FEATURES, Hypotheses, HypothesisScore, hypothesis_features, hypothesise, select
 from torchcrf_scan.inference.surface import Surface
+from torchcrf_scan.learning.disturb import bump, skew
 from torchcrf_scan.scan import ScanPair
+
+log = logging.getLogger(__name__)
 
 MOST_MOVERS = 6
 IGNORED = -2  # body of a point that nobody annotated
 FOUND_SHARE = 0.15  # of the views start from the background that is found, as in use; the others, cheaper, from the disturbed truth
 BACKGROUND_ERROR = 0.5  # units
 BUMP = 0.5  # units of range error that neighbouring beams share: a tilted sensor hits other heights
-BUMP_BEAMS = 8
 SKEW = 0.3  # units that a scan's ends are displaced by: the sensor moves while it turns
 KEPT_BEAMS = (0.5, 1.0)
 PURE = 0.7  # share of a mover's points in the members of a hypothesis that is taken as its
@@ -74,8 +77,11 @@ def fit_hypothesis_score(pairs: Sequence[ScanPair], *, views: int = 3, seed: int
 
     Takes about 0.15 s a pair and view.
 
+    Returns:
+        The fitted score, or the default one where the pairs hold no mover, or nothing else.
+
     Raises:
-        ValueError: a pair without annotation, or no hypothesis of some class.
+        ValueError: a pair without annotation.
     """
     if any(pair.annotation is None for pair in pairs):
         raise ValueError("pairs: expected annotated pairs, got some without annotation")
@@ -84,7 +90,8 @@ def fit_hypothesis_score(pairs: Sequence[ScanPair], *, views: int = 3, seed: int
     features = torch.cat([view.features for view in seen]) if seen else torch.zeros(0, len(FEATURES))
     label = torch.cat([view.label for view in seen]) if seen else torch.zeros(0)
     if not ((label == 0).any() and (label == 1).any()):
-        raise ValueError("pairs: expected hypotheses of movers and others, got none of one kind")
+        log.warning("no hypotheses of one kind to learn from: keeping the default score of movers")
+        return HypothesisScore()
     score = fit_logistic(features[label >= 0], label[label >= 0])
     score.threshold.fill_(_best_threshold(score, seen))
     return score
@@ -114,7 +121,8 @@ def _view(pair: ScanPair, generator: torch.Generator) -> _View | None:
     source = Surface.of(batch.source[0][kept[0]], noise, pair.source.is_closed)
     target = Surface.of(batch.target[0][kept[1]], noise, pair.target.is_closed)
     unit = unit_length(source, target)
-    source = Surface.of(_bump(_skew(source, unit, generator), unit, generator), noise, pair.source.is_closed)
+    points = skew(source.points[None], torch.ones(1, len(source), dtype=torch.bool), SKEW * unit[None], generator)
+    source = Surface.of(bump(points, BUMP * unit[None], generator)[0], noise, pair.source.is_closed)
     motions = torch.from_numpy(pair.annotation.motions).to(source.points)
     known = np.where(pair.annotation.ignore, IGNORED, pair.annotation.body)
     body = torch.from_numpy(known[pair.source.beam])[kept[0]]
@@ -130,22 +138,6 @@ def _thin(count: int, generator: torch.Generator) -> Tensor:
     share = torch.empty(()).uniform_(*KEPT_BEAMS, generator=generator)
     share = torch.where(torch.rand((), generator=generator) < 0.5, share, torch.ones(()))
     return (torch.rand(count, generator=generator) < share).nonzero()[:, 0]
-
-
-def _skew(surface: Surface, unit: Tensor, generator: torch.Generator) -> Tensor:
-    """(P, 2) points as a sensor returns them that moves on during its sweep, relative to its middle."""
-    phase = torch.linspace(-1, 1, len(surface)).to(surface.points)
-    twist = SKEW * unit * torch.randn(3, generator=generator)
-    twist = torch.cat([twist[:1] / surface.ranges.median(), twist[1:]])
-    return se2.apply(phase[:, None] * twist, surface.points[:, None])[:, 0]
-
-
-def _bump(points: Tensor, unit: Tensor, generator: torch.Generator) -> Tensor:
-    """(P, 2) points whose ranges err alike where they are neighbours."""
-    knots = torch.randn(1, 1, len(points) // BUMP_BEAMS + 2, generator=generator) * BUMP * unit
-    errors = torch.nn.functional.interpolate(knots, len(points), mode="linear")[0, 0]
-    ranges = torch.linalg.vector_norm(points, dim=-1).clamp(min=1e-6)
-    return points * (1 + errors / ranges).clamp(min=0.5)[:, None]
 
 
 def _background(source: Surface, target: Surface, truth: Tensor, unit: Tensor, generator: torch.Generator) -> Tensor:
