@@ -24,6 +24,7 @@ from torchcrf_scan import (
 )
 from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.initialise import Start
 
@@ -99,12 +100,20 @@ def assert_equal(found: PairPrediction, expected: PairPrediction) -> None:
 
 def test_thirty_named_weights_in_the_papers_order() -> None:
     model = JointScanCRF()
-    assert tuple(model.association_weights) == ASSOCIATION
-    assert tuple(model.clustering_weights) == CLUSTERING
+    assert tuple(ASSOCIATION_WEIGHTS) == ASSOCIATION
+    assert tuple(CLUSTERING_WEIGHTS) == CLUSTERING
+    assert set(model.association_weights) == set(ASSOCIATION)
+    assert set(model.clustering_weights) == set(CLUSTERING)
     assert (len(ASSOCIATION), len(CLUSTERING)) == (18, 12)
     assert len(list(model.parameters())) == 30
     assert all(weight.shape == () for weight in model.parameters())
     assert [len(vector) for vector in model.weight_vectors] == [18, 12]
+
+
+def test_the_parameters_keep_the_papers_order() -> None:
+    model = JointScanCRF()
+    assert tuple(model.association_weights) == ASSOCIATION
+    assert tuple(model.clustering_weights) == CLUSTERING
 
 
 @pytest.mark.parametrize("layer", [JointScanCRF, MatchingCRF, ClusteringCRF])
@@ -311,7 +320,9 @@ def test_a_still_scan_stays() -> None:
 
 
 def soft_model(metric: str, iterations: int = 2) -> JointScanCRF:
-    model = make_model(JointScanCRF, clusters=3, iterations=iterations, motion_metric=metric, min_extent=0.0, **SOFT).double()
+    settings = InferenceConfig(clusters=3, iterations=iterations, motion_metric=metric, min_extent=0.0, **SOFT)  # type: ignore[arg-type]
+    features = FeatureConfig(length_unit="metre")  # no gradient passes through the choice of a unit
+    model = JointScanCRF(ModelConfig(features=features, inference=settings)).double()
     model.scales.local.fill_(2.0)  # no error is capped
     model.scales.pairwise.fill_(2.0)
     for name in ("cluster_distance", "neighbour_distance", "neighbour_weight"):

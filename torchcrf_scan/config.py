@@ -179,6 +179,8 @@ class LearningConfig:
     Attributes:
         rotation_noise: radians of noise on the true motions.
         translation_noise: metres of noise on the true motions.
+        objective: `pseudo_likelihood` (the paper's), or `likelihood`: the exact likelihood of each chain, without the former's
+            over-strong pairwise weights (spec 6.5).
         disturbance: units of resolution by which training scans are skewed and bumped, as moving sensors do; 0: as they are.
         start_share: share of the pairs whose features see InitialiseRT's motions instead.
         predicted_share: share of the pairs whose clustering features see predicted associations (A-28).
@@ -191,6 +193,7 @@ class LearningConfig:
         seed: of everything drawn while learning.
     """
 
+    objective: str = "pseudo_likelihood"
     rotation_noise: float = 0.005
     translation_noise: float = 0.02
     disturbance: float = 1.0
@@ -203,6 +206,9 @@ class LearningConfig:
     tolerance: float = 1e-4
     batch_size: int = 16
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        _choose("objective", self.objective, ("pseudo_likelihood", "likelihood"))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 It needs the features alone, as one tensor a chain: `association_design` and `clustering_design`, rows = nodes, columns = states.
 A conditional logit over them is the objective, convex in the weights; learning builds the designs once and optimises on them.
+`Chain` keeps the transitions too, for the exact likelihood (spec 6.5).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from torchcrf_scan.features.potentials import (
 )
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.joint import Parameters
+from torchcrf_scan.inference.messages import log_partition
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,39 @@ class Design:
         score = (self.features @ weights).masked_fill(~self.mask, -torch.inf)
         chosen = torch.log_softmax(score, dim=-1).gather(-1, self.label[..., None])[..., 0]
         return torch.where(self.known, chosen, torch.zeros_like(chosen))
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """A chain's features in every state and transition.
+
+    Attributes:
+        unary: (B, N, S, U), pairwise: (B, N-1, S, S, P) features; their weights are U + P.
+        mask: (B, N, S) possible states. label: (B, N) true state. known: (B, N) nodes that count; the others cut the chain.
+    """
+
+    unary: Tensor
+    pairwise: Tensor
+    mask: Tensor
+    label: Tensor
+    known: Tensor
+
+    def design(self) -> Design:
+        """The features that pseudo-likelihood needs."""
+        features = torch.cat([self.unary, at_true_neighbours(self.pairwise, self.label, self.known)], dim=-1)
+        return Design(features, self.mask, self.label, self.known)
+
+    def log_likelihood(self, weights: Tensor) -> Tensor:
+        """(B,) exact log p(true labels | observation) by the forward recursion (spec 6.5). weights: (U + P,)."""
+        split = self.unary.shape[-1]
+        log_unary = (self.unary @ weights[:split]).masked_fill(~self.mask, -torch.inf)
+        log_unary = torch.where(self.known[..., None], log_unary, torch.zeros_like(log_unary))
+        both = self.known[:, 1:] & self.known[:, :-1]
+        log_pairwise = (self.pairwise @ weights[split:]) * both[..., None, None]
+        of_nodes = log_unary.gather(-1, self.label[..., None])[..., 0]
+        rows = log_pairwise.gather(2, self.label[:, :-1, None, None].expand(-1, -1, 1, log_pairwise.shape[3]))[:, :, 0]
+        of_edges = rows.gather(-1, self.label[:, 1:, None])[..., 0]
+        return of_nodes.sum(-1) + of_edges.sum(-1) - log_partition(log_unary, log_pairwise)
 
 
 def true_plugins(batch: ScanPairBatch, clusters: int) -> PlugIns:
@@ -114,8 +149,8 @@ def with_truth(index: Tensor, mask: Tensor, association: Tensor) -> tuple[Tensor
     return index, mask, torch.where(is_inlier, place, K)
 
 
-def association_design(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, count: int) -> Design:
-    """The association chain's 18 features of every state; `count` candidates and the truth, or every target (0)."""
+def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, count: int) -> Chain:
+    """The association chain's 14 + 4 features; states are `count` candidates and the truth, or every target (0)."""
     batch = view.batch
     truth = _truth_of(batch)
     found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, count)
@@ -127,12 +162,16 @@ def association_design(view: PairView, plugins: PlugIns, scales: Scales, booster
     unary = association_unary(states, moved, batch.target, scales, boosters)
     pairwise = pairwise_features(batch.source, batch.target, index, scales)
     known = truth.known & batch.source_mask
-    features = torch.cat([unary, at_true_neighbours(pairwise, label, known)], dim=-1)
-    return Design(features, state_mask(mask), label, known)
+    return Chain(unary, pairwise, state_mask(mask), label, known)
 
 
-def clustering_design(view: PairView, plugins: PlugIns, scales: Scales) -> Design:
-    """The clustering chain's 12 features of every state."""
+def association_design(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, count: int) -> Design:
+    """The association chain's 18 features of every state at the true labels of its neighbours."""
+    return association_chain(view, plugins, scales, boosters, count).design()
+
+
+def clustering_chain(view: PairView, plugins: PlugIns, scales: Scales) -> Chain:
+    """The clustering chain's 4 + 8 features."""
     batch = view.batch
     C = plugins.motions.shape[1]
     found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, 1)
@@ -141,8 +180,12 @@ def clustering_design(view: PairView, plugins: PlugIns, scales: Scales) -> Desig
     pairwise = clustering.pairwise_features(batch.source, at, scales)
     label = torch.where(plugins.label >= 0, plugins.label, C)
     known = plugins.known & batch.source_mask
-    features = torch.cat([local, at_true_neighbours(pairwise, label, known)], dim=-1)
-    return Design(features, possible_clusters(plugins.active, plugins.reach, label.shape[1]), label, known)
+    return Chain(local, pairwise, possible_clusters(plugins.active, plugins.reach, label.shape[1]), label, known)
+
+
+def clustering_design(view: PairView, plugins: PlugIns, scales: Scales) -> Design:
+    """The clustering chain's 12 features of every state at the true labels of its neighbours."""
+    return clustering_chain(view, plugins, scales).design()
 
 
 def at_true_neighbours(pairwise: Tensor, label: Tensor, known: Tensor) -> Tensor:

@@ -19,12 +19,12 @@ from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHT
 from torchcrf_scan.inference import joint, pseudo_likelihood
 from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.motion import Motions
-from torchcrf_scan.inference.pseudo_likelihood import Design, PlugIns
+from torchcrf_scan.inference.pseudo_likelihood import Chain, PlugIns
 from torchcrf_scan.learning.boosting_fit import fit_boosters
 from torchcrf_scan.learning.disturb import disturb
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.scales_fit import fit_scales
-from torchcrf_scan.learning.weights_fit import Watch, fit_weights, flatten
+from torchcrf_scan.learning.weights_fit import Watch, fit_chain
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
 
@@ -86,13 +86,13 @@ def fit(model: JointScanCRF, material: Sequence[Material], config: LearningConfi
     predicted = [lesson.start.association for lesson in lessons]
     if chains != "clustering":
         margins = fit_all_boosters(model, lessons, config, generator)
-        designs = [association_design(model, lesson, margins[lesson.fold]) for lesson in lessons]
-        set_weights(model, "association", fit_weights(flatten(designs, live_weights(model)), config, watch.get("association")))
+        features = [association_chain(model, lesson, margins[lesson.fold]) for lesson in lessons]
+        set_weights(model, "association", fit_chain(features, live_weights(model), config, watch.get("association")))
         predicted = [predict_association(model, lesson, margins[lesson.fold]) for lesson in lessons]
     if chains != "matching":
-        designs = [cluster_design(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True)]
+        features = [clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True)]
         live = torch.ones(len(CLUSTERING_WEIGHTS), dtype=torch.float64)
-        set_weights(model, "clustering", fit_weights(flatten(designs, live), config, watch.get("clustering")))
+        set_weights(model, "clustering", fit_chain(features, live, config, watch.get("clustering")))
 
 
 def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generator: torch.Generator) -> Lesson:
@@ -143,10 +143,10 @@ def fit_all_boosters(
     return {number: fit_on(part) for number, part in tqdm(jobs.items(), desc="boosters", unit="fold", leave=False)}
 
 
-def association_design(model: JointScanCRF, lesson: Lesson, margins: Boosters) -> Design:
+def association_chain(model: JointScanCRF, lesson: Lesson, margins: Boosters) -> Chain:
     """The lesson's association features with margins of boosters that have not seen it."""
     count = model.config.inference.candidates
-    return pseudo_likelihood.association_design(lesson.view, lesson.plugins, model.scales, margins, count)
+    return pseudo_likelihood.association_chain(lesson.view, lesson.plugins, model.scales, margins, count)
 
 
 def predict_association(model: JointScanCRF, lesson: Lesson, margins: Boosters) -> Tensor:
@@ -162,13 +162,13 @@ def predict_association(model: JointScanCRF, lesson: Lesson, margins: Boosters) 
         return joint.update_association(lesson.view, state, found, parameters, config).association
 
 
-def cluster_design(
+def clustering_chain(
     model: JointScanCRF, lesson: Lesson, predicted: Tensor, config: LearningConfig, generator: torch.Generator
-) -> Design:
+) -> Chain:
     """The lesson's clustering features, with predicted associations for some pairs; for all where the chain stands alone (A-28)."""
     share = config.predicted_share if model.config.chains == "joint" else 1.0
     plugins = mix_associations(lesson.plugins, predicted, share, generator)
-    return pseudo_likelihood.clustering_design(lesson.view, plugins, model.scales)
+    return pseudo_likelihood.clustering_chain(lesson.view, plugins, model.scales)
 
 
 def live_weights(model: JointScanCRF) -> Tensor:

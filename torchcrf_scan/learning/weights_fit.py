@@ -1,8 +1,9 @@
-"""The convex part of learning: the weights of one chain from its designs (spec 6.3, 6.4)."""
+"""The convex part of learning: the weights of one chain from its features (spec 6.3 to 6.5)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,50 +11,92 @@ from scipy.optimize import OptimizeResult, minimize
 from torch import Tensor
 
 from torchcrf_scan.config import LearningConfig
-from torchcrf_scan.inference.pseudo_likelihood import Design
+from torchcrf_scan.inference.pseudo_likelihood import Chain, Design
 
 Watch = Callable[[int, float, float, Tensor], None]
 
 
-def flatten(designs: Sequence[Design], live: Tensor) -> Design:
-    """All known nodes of many batches as one row of nodes: features (1, P, S, W), float64, dead columns zero."""
+def flatten(designs: Sequence[Design]) -> Design:
+    """All known nodes of many batches as one row of nodes: features (1, P, S, W), float64."""
     states = max(design.features.shape[2] for design in designs)
 
     def rows(design: Design) -> tuple[Tensor, Tensor, Tensor]:
-        spare = states - design.features.shape[2]  # the outlier stays the last state
-        features = design.features.detach().double()[design.known] * live
-        mask, label = design.mask[design.known], design.label[design.known]
         own = design.features.shape[2] - 1
-        label = torch.where(label == own, states - 1, label)
+        features, mask, label = (
+            part[design.known] for part in (design.features.detach().double(), design.mask, design.label)
+        )
+        spare = states - design.features.shape[2]  # the outlier stays the last state
         features = torch.cat([features[:, :own], features.new_zeros(len(features), spare, features.shape[2]), features[:, own:]], 1)
         mask = torch.cat([mask[:, :own], mask.new_zeros(len(mask), spare), mask[:, own:]], dim=1)
-        return features, mask, label
+        return features, mask, torch.where(label == own, states - 1, label)
 
     parts = [rows(design) for design in designs]
     features, mask, label = (torch.cat([part[k] for part in parts])[None] for k in range(3))
     return Design(features, mask, label, torch.ones_like(label, dtype=torch.bool))
 
 
-def fit_weights(design: Design, config: LearningConfig, watch: Watch | None = None) -> Tensor:
-    """Minimises -PL(w) + w^T w / (2 s_w^2) over standardised features by L-BFGS from 0; convex, so one optimum.
+def fit_chain(chains: Sequence[Chain], live: Tensor, config: LearningConfig, watch: Watch | None = None) -> Tensor:
+    """The weights of one chain, by `config.objective`: pseudo-likelihood, or from its optimum on by exact likelihood.
 
     Args:
-        design: one row of nodes, see `flatten`.
+        live: (W,) 1 for the weights that are learned, 0 for those that stay 0.
+
+    Returns:
+        (W,) float64.
+    """
+    design = flatten([chain.design() for chain in chains])
+    weights = fit_weights(design, config, watch, live=live)
+    if config.objective == "pseudo_likelihood":
+        return weights
+    exact = [double(chain) for chain in chains]
+    return fit_weights(
+        design,
+        config,
+        watch,
+        live=live,
+        start=weights,
+        log_likelihood=lambda w: torch.stack([chain.log_likelihood(w).sum() for chain in exact]).sum(),
+    )
+
+
+def double(chain: Chain) -> Chain:
+    """The chain with float64 features and without a gradient of their own."""
+    return replace(chain, unary=chain.unary.detach().double(), pairwise=chain.pairwise.detach().double())
+
+
+def fit_weights(
+    design: Design,
+    config: LearningConfig,
+    watch: Watch | None = None,
+    *,
+    live: Tensor | None = None,
+    start: Tensor | None = None,
+    log_likelihood: Callable[[Tensor], Tensor] | None = None,
+) -> Tensor:
+    """Minimises -log likelihood + w^T w / (2 s_w^2) by L-BFGS, w in units of the features' spread; convex, so one optimum.
+
+    Args:
+        design: one row of nodes, see `flatten`; its log pseudo-likelihood is the objective where no other is given.
         watch: called with (step, objective per node, largest gradient entry per node, weights) after every step.
+        live: (W,) 1 for the weights that are learned, 0 for those that stay 0; None: all.
+        start: (W,) weights to begin with; None: 0.
+        log_likelihood: (W,) -> (), another objective on the same features.
 
     Returns:
         (W,) float64 weights for the features as they are.
     """
     spread = design.features[design.mask].std(dim=0)
-    spread = torch.where(spread > 1e-9, spread, torch.ones_like(spread))
-    scaled = Design(design.features / spread, design.mask, design.label, design.known)
+    per_unit = 1 / torch.where(spread > 1e-9, spread, torch.ones_like(spread))
+    if live is not None:
+        per_unit = per_unit * live
     nodes = max(1, int(design.known.sum()))
+    measure = log_likelihood or (lambda weights: design.log_likelihood(weights).sum())
     step = 0
 
     def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
-        weights = torch.from_numpy(values).requires_grad_()
-        loss = ((weights**2).sum() / (2 * config.prior**2) - scaled.log_likelihood(weights).sum()) / nodes
-        (slope,) = torch.autograd.grad(loss, weights)
+        scaled = torch.from_numpy(values).requires_grad_()
+        loss = ((scaled**2).sum() / (2 * config.prior**2) - measure(scaled * per_unit)) / nodes
+        (slope,) = torch.autograd.grad(loss, scaled)
         return loss.item(), slope.numpy()
 
     def look(intermediate_result: OptimizeResult) -> None:
@@ -61,9 +104,9 @@ def fit_weights(design: Design, config: LearningConfig, watch: Watch | None = No
         step += 1
         if watch is not None:
             loss, slope = objective(intermediate_result.x)
-            watch(step, loss, float(np.abs(slope).max()), torch.from_numpy(intermediate_result.x) / spread)
+            watch(step, loss, float(np.abs(slope).max()), torch.from_numpy(intermediate_result.x) * per_unit)
 
+    first = torch.zeros_like(per_unit) if start is None else torch.where(per_unit > 0, start / per_unit.clamp(min=1e-12), 0.0)
     options = {"maxiter": config.max_steps, "gtol": config.tolerance, "ftol": 0.0, "maxcor": 10}
-    start = np.zeros(design.features.shape[-1])
-    found = minimize(objective, start, jac=True, method="L-BFGS-B", callback=look, options=options)
-    return torch.from_numpy(found.x) / spread
+    found = minimize(objective, first.numpy(), jac=True, method="L-BFGS-B", callback=look, options=options)
+    return torch.from_numpy(found.x) * per_unit
