@@ -61,7 +61,8 @@ def check_annotation(pair: ScanPair, config: SimulatorConfig) -> None:
     _, step = simulate.beam_bearings(config)
     widest = target.ranges[partner] * step / simulate.LEAST_COSINE
     gap = np.hypot(*(moved - target.points[partner]).T)
-    assert (gap <= simulate.association_gate(widest, config) + 1e-12).all()
+    usual = float(np.median(target.ranges) * step / simulate.LEAST_COSINE) if len(target) else 0.0
+    assert (gap <= simulate.association_gate(widest, usual, config) + 1e-12).all()
 
 
 def test_same_seed_same_bytes():

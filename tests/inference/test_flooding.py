@@ -1,4 +1,4 @@
-"""Algorithm 1 as printed against the exact chains: the same beliefs where the motions stand still, the same labels on easy pairs."""
+"""Algorithm 1 as printed against the exact chains: equal beliefs where the motions stand still, equal labels on easy pairs."""
 
 from dataclasses import replace
 

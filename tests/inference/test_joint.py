@@ -1,4 +1,4 @@
-"""The sweep schedule on scenes small enough to enumerate: exact chains, batches, slots, and scans with little or nothing in them."""
+"""The sweep schedule on scenes small enough to enumerate: exact chains, batches, slots, scans with little in them."""
 
 from dataclasses import fields, replace
 
@@ -72,7 +72,9 @@ def config(chains: str = "joint", **inference: object) -> ModelConfig:
     return ModelConfig(chains=chains, inference=InferenceConfig(**inference))  # type: ignore[arg-type]
 
 
-def decode(batch: ScanPairBatch, start: Start, settings: ModelConfig | None = None, parameters: Parameters | None = None) -> Prediction:
+def decode(
+    batch: ScanPairBatch, start: Start, settings: ModelConfig | None = None, parameters: Parameters | None = None
+) -> Prediction:
     with torch.no_grad():
         return joint.decode(PairView.of(batch), start, parameters or MODEL.fitted, settings or config())
 
@@ -131,7 +133,9 @@ def test_the_clustering_chain_equals_brute_force(seed: int, temperature: float) 
     scales, weights = parameters.scales, parameters.clustering.numpy()
     arrays = source.numpy(), target.numpy(), MOTIONS.numpy()
     labels = association[0].tolist()
-    local = oracles.local_clustering(*arrays, active.tolist(), labels, float(scales.cluster_distance), float(scales.outlier_threshold))
+    local = oracles.local_clustering(
+        *arrays, active.tolist(), labels, float(scales.cluster_distance), float(scales.outlier_threshold)
+    )
     pairwise = oracles.pairwise_clustering(*arrays, labels, float(scales.neighbour_weight), float(scales.neighbour_distance))
     unary = local @ weights[:4]
     unary[:, :3][:, ~active.numpy()] = -np.inf
@@ -154,7 +158,9 @@ def test_the_association_chain_equals_brute_force(seed: int, temperature: float)
     local = oracles.local_association(source.numpy(), target.numpy(), scales.local.tolist(), [0.0, 0.0, 0.0], moved)
     outlier = np.broadcast_to(scales.local_outlier.numpy(), (5, 1, 12))
     unary = np.concatenate([local, outlier], axis=1) @ weights[:12]  # without boosters their two channels are zero
-    pairwise = oracles.pairwise_association(source.numpy(), target.numpy(), scales.pairwise.tolist(), scales.pairwise_outlier.tolist())
+    pairwise = oracles.pairwise_association(
+        source.numpy(), target.numpy(), scales.pairwise.tolist(), scales.pairwise_outlier.tolist()
+    )
     assert_close(found.log_association[0], oracles.log_marginals(unary, pairwise @ weights[14:], temperature))
     if temperature == 0:
         best = oracles.best_labelling(unary, pairwise @ weights[14:])
@@ -222,8 +228,12 @@ def simulated() -> tuple[ScanPairBatch, Start]:
 
 
 @pytest.mark.parametrize("chains", ["joint", "matching", "clustering"])
-@pytest.mark.parametrize("settings", [{}, {"temperature": 1.0, "motion_weights": "soft"}, {"motion_metric": "point", "candidates": 0}])
-def test_every_pair_is_decoded_as_if_alone(simulated: tuple[ScanPairBatch, Start], settings: dict[str, object], chains: str) -> None:
+@pytest.mark.parametrize(
+    "settings", [{}, {"temperature": 1.0, "motion_weights": "soft"}, {"motion_metric": "point", "candidates": 0}]
+)
+def test_every_pair_is_decoded_as_if_alone(
+    simulated: tuple[ScanPairBatch, Start], settings: dict[str, object], chains: str
+) -> None:
     batch, start = simulated
     if chains == "matching":
         start = start.background_alone()

@@ -83,7 +83,9 @@ def test_outliers_and_points_without_association_say_nothing(metric: str) -> Non
     tangents = torch.nn.functional.normalize(normal(*target.shape, seed=9), dim=-1)
     everyone = torch.arange(30)[None]
     previous = started(TRUE[None] + 0.01)
-    expected = refit(source[:, 6:], hard_support(source[:, 6:], target, tangents, everyone[:, 6:], labels[:, 6:], 3), previous, metric)
+    expected = refit(
+        source[:, 6:], hard_support(source[:, 6:], target, tangents, everyone[:, 6:], labels[:, 6:], 3), previous, metric
+    )
     association, cluster = everyone.clone(), labels.clone()
     association[:, :3], cluster[:, 3:6] = -1, -1
     found = refit(source, hard_support(source, target, tangents, association, cluster, 3), previous, metric)

@@ -222,7 +222,10 @@ def test_the_hessian_is_positive_definite_with_the_prior(pairs: ScanPairBatch, c
 
 def designs(batch: ScanPairBatch) -> list[Design]:
     view, plugins = PairView.of(batch), true_plugins(batch, C)
-    return [association_design(view, plugins, Scales().double(), Boosters(1).double(), 0), clustering_design(view, plugins, Scales().double())]
+    return [
+        association_design(view, plugins, Scales().double(), Boosters(1).double(), 0),
+        clustering_design(view, plugins, Scales().double()),
+    ]
 
 
 def annotated(batch: ScanPairBatch, **changes: Tensor) -> ScanPairBatch:
@@ -301,7 +304,8 @@ def test_a_batch_is_its_pairs(pairs: ScanPairBatch, layer: type[JointScanCRF]) -
 
 def test_more_candidates_are_more_alternatives(pairs: ScanPairBatch) -> None:
     values = [
-        MatchingCRF(ModelConfig(inference=InferenceConfig(candidates=count))).double().pseudo_log_likelihood(pairs) for count in (2, 8, 0)
+        MatchingCRF(ModelConfig(inference=InferenceConfig(candidates=count))).double().pseudo_log_likelihood(pairs)
+        for count in (2, 8, 0)
     ]
     assert (values[0] > values[1]).all()
     assert (values[1] > values[2]).all()

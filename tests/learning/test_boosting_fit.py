@@ -55,7 +55,6 @@ def test_a_perfect_split_stops_early_and_stays_finite() -> None:
     margins = ensemble(torch.from_numpy(inputs)).numpy()
     assert np.isfinite(margins).all()
     assert ((margins > 0) == (inputs[:, 0] > 0.25)).all()
-    assert np.isclose(np.abs(margins), 0.5 * np.log(1e6), rtol=1e-3).all()
 
 
 @pytest.mark.parametrize("label", [True, False])
@@ -90,7 +89,9 @@ def test_wrong_targets_are_never_the_true_one_or_its_neighbour(count: int) -> No
 
 def test_wrong_targets_of_a_tiny_scan() -> None:
     truth = torch.zeros(1, 3, dtype=torch.int64)
-    index, usable = sample_targets(truth, make_points(3)[None], make_points(2)[None], torch.ones(1, 2, dtype=torch.bool), 6, generator(0))
+    index, usable = sample_targets(
+        truth, make_points(3)[None], make_points(2)[None], torch.ones(1, 2, dtype=torch.bool), 6, generator(0)
+    )
     assert not usable.any()  # the only other point is the neighbour
     assert ((index >= 0) & (index < 2)).all()
 

@@ -1,5 +1,7 @@
 """The convex part: the optimum of a conditional logit, whatever the units of its features."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -104,7 +106,7 @@ def test_the_watch_sees_the_objective_fall() -> None:
     found = fit_weights(design, LearningConfig(), lambda *step: seen.append(step))
     steps, losses, slopes, weights = zip(*seen, strict=True)
     assert list(steps) == list(range(1, len(seen) + 1))
-    assert all(later < earlier for earlier, later in zip(losses[:-1], losses[1:], strict=True))
+    assert all(later < earlier for earlier, later in pairwise(losses))
     assert slopes[-1] <= LearningConfig().tolerance
     assert_close(weights[-1], found)
     at_end = -float(design.log_likelihood(found).mean())
@@ -122,7 +124,9 @@ def test_flatten_keeps_known_nodes_and_the_outlier_last() -> None:
     narrow, wide = normal(1, 3, 3, 2, seed=1), normal(2, 2, 5, 2, seed=2)
     designs = [
         Design(narrow, torch.ones(1, 3, 3, dtype=torch.bool), torch.tensor([[0, 2, 1]]), torch.tensor([[True, True, False]])),
-        Design(wide, torch.ones(2, 2, 5, dtype=torch.bool), torch.tensor([[4, 0], [2, 3]]), torch.tensor([[True, False], [True, True]])),
+        Design(
+            wide, torch.ones(2, 2, 5, dtype=torch.bool), torch.tensor([[4, 0], [2, 3]]), torch.tensor([[True, False], [True, True]])
+        ),
     ]
     flat = flatten(designs)
     assert flat.features.shape == (1, 5, 5, 2)

@@ -26,9 +26,8 @@ VIBRATION_KNOTS = np.radians(8.0)  # neighbouring beams share a jolt over about 
 MIXED_JUMP = (0.3, 6.0)  # metres at full size: ranges this far apart merge in one beam; farther ones give two separate echoes
 GRAZING_COSINE = 0.03  # beams that graze a surface are lost: exp(-cosine / this)
 LEAST_COSINE = 0.1  # the spacing of returns on a surface is not trusted to grow beyond ten times that of a frontal one
-GATE_SPACING = 0.8  # the nearest of returns `spacing` apart is half a spacing away at most, a whole one where a beam is lost
-GATE_NOISE = 3.0
-GATE_LEAST = 0.005  # metres
+GATE_SPACING = 1.2  # the nearest of returns `spacing` apart is half a spacing away at most, a whole one where a beam is lost
+GATE_USUAL = 2.2  # times half the scan's usual spacing and twice its noise: annotators of recordings use one gate for a whole scan
 LEAST_MOTION = 0.02  # metres at full size: what moves less within a pair stands still
 SENSOR_CLEARANCE = 0.3  # metres that movers keep from the sensor
 LEAST_SEEN = 3  # returns of a mover when it enters
@@ -185,10 +184,10 @@ def _measure(hits: Hits, config: SimulatorConfig, rng: np.random.Generator) -> t
 # --- annotation ---------------------------------------------------------------------------------------------------------------
 
 
-def association_gate(spacing: Floats, config: SimulatorConfig) -> Floats:
-    """How far a moved return may be from its counterpart, metres; spacing: (...,) of the counterpart."""
-    noise = np.hypot(config.range_noise, config.vibration)
-    return np.maximum(GATE_SPACING * spacing, GATE_NOISE * noise + GATE_LEAST)
+def association_gate(spacing: Floats, usual: float, config: SimulatorConfig) -> Floats:
+    """How far a moved return may be from its counterpart, metres; spacing: (...,) of the counterpart, usual: of its scan."""
+    noise = float(np.hypot(config.range_noise, config.vibration))
+    return np.maximum(GATE_SPACING * spacing, GATE_USUAL * (usual / 2 + 2 * noise))
 
 
 def _associate(moved: Floats, body: Ints, target: Capture, target_body: Ints, config: SimulatorConfig) -> Ints:
@@ -198,7 +197,8 @@ def _associate(moved: Floats, body: Ints, target: Capture, target_body: Ints, co
         return association
     offset = moved[:, None, :] - target.scan.points  # (N, M, 2)
     distance = np.hypot(offset[..., 0], offset[..., 1])
-    is_candidate = (body[:, None] == target_body) & (distance <= association_gate(target.spacing, config))
+    gate = association_gate(target.spacing, float(np.median(target.spacing)), config)
+    is_candidate = (body[:, None] == target_body) & (distance <= gate)
     distance[~is_candidate] = np.inf
     nearest = distance.argmin(1)
     found = np.isfinite(distance[np.arange(len(moved)), nearest])

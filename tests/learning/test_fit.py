@@ -1,0 +1,165 @@
+"""Fitting a model: folds that keep sequences whole, boosters that have not seen their pairs, better weights than before."""
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, LearningConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS
+from torchcrf_scan.inference.pseudo_likelihood import pseudo_log_likelihood
+from torchcrf_scan.learning.fit import Material, assign_folds, fit, fit_all_boosters, gather_material, prepare, set_weights
+from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
+from torchcrf_scan.scan import Scan, ScanPair
+
+LEARNING = LearningConfig(folds=2, negatives=3, batch_size=2)
+MODEL = ModelConfig(features=FeatureConfig(stumps=15), inference=InferenceConfig(clusters=6))
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[ScanPair]:
+    return simulate_pairs(SimulatorConfig(beams=91), 6, 3, 4)
+
+
+@pytest.fixture(scope="module")
+def material(pairs: list[ScanPair]) -> list[Material]:
+    return gather_material(JointScanCRF(MODEL), pairs, LEARNING)
+
+
+@pytest.fixture(scope="module")
+def fitted(material: list[Material]) -> JointScanCRF:
+    model = JointScanCRF(MODEL)
+    fit(model, material, LEARNING)
+    return model
+
+
+def named(*sequences: str) -> list[ScanPair]:
+    scan = Scan.from_ranges([1.0], [0.0])
+    return [ScanPair(scan, scan, sequence=sequence) for sequence in sequences]
+
+
+@pytest.mark.parametrize("folds", [1, 2, 3, 5])
+def test_folds_keep_sequences_whole(folds: int) -> None:
+    pairs = named(*"aaaabbbccdddddeffg")
+    numbers = assign_folds(pairs, folds)
+    assert sorted(set(numbers)) == list(range(folds))
+    for sequence in "abcdefg":
+        assert len({number for pair, number in zip(pairs, numbers, strict=True) if pair.sequence == sequence}) == 1
+    sizes = [numbers.count(number) for number in range(folds)]
+    assert max(sizes) - min(sizes) <= 5
+
+
+@pytest.mark.parametrize("folds", [0, 1])
+def test_no_folds_are_one(folds: int) -> None:
+    assert assign_folds(named("a", "b", "a"), folds) == [0, 0, 0]
+
+
+def test_no_more_folds_than_sequences() -> None:
+    assert sorted(assign_folds(named("a", "b", "a"), 5)) == [0, 0, 1]
+
+
+def test_material_is_batches_of_one_fold(pairs: list[ScanPair], material: list[Material]) -> None:
+    assert sum(len(part.batch) for part in material) == len(pairs)
+    assert all(len(part.batch) <= LEARNING.batch_size for part in material)
+    assert {part.fold for part in material} == {0, 1}
+    assert all(part.start.motions.shape == (len(part.batch), 5, 3) for part in material)
+
+
+def test_pairs_without_annotation_are_refused(pairs: list[ScanPair]) -> None:
+    with pytest.raises(ValueError, match=f"pairs: expected annotated pairs, got .*{pairs[1].name}"):
+        gather_material(JointScanCRF(MODEL), [pairs[0], replace(pairs[1], annotation=None)], LEARNING)
+    with pytest.raises(ValueError, match="pairs: expected annotated pairs, got none"):
+        gather_material(JointScanCRF(MODEL), [], LEARNING)
+
+
+def test_a_folds_boosters_have_not_seen_it(material: list[Material]) -> None:
+    model = JointScanCRF(MODEL)
+    generator = torch.Generator().manual_seed(0)
+    lessons = [prepare(model, part, LEARNING, generator) for part in material]
+    margins = fit_all_boosters(model, lessons, LEARNING, torch.Generator().manual_seed(0))
+    assert sorted(margins) == [0, 1]
+    tables = [boosters.data.table for boosters in (margins[0], margins[1], model.boosters)]
+    assert not torch.equal(tables[0], tables[1])
+    assert not torch.equal(tables[0], tables[2])
+    others = [replace(lesson, fold=1) if lesson.fold == 1 else lesson for lesson in lessons if lesson.fold == 1]
+    alone = fit_all_boosters(JointScanCRF(MODEL), others, LEARNING, torch.Generator().manual_seed(5))
+    assert list(alone) == [1]  # one fold alone has nothing to be kept from
+
+
+def test_one_fold_uses_the_same_boosters(material: list[Material]) -> None:
+    model = JointScanCRF(MODEL)
+    lessons = [prepare(model, replace(part, fold=0), LEARNING, torch.Generator().manual_seed(0)) for part in material[:1]]
+    margins = fit_all_boosters(model, lessons, LEARNING, torch.Generator().manual_seed(0))
+    assert list(margins) == [0]
+    assert torch.equal(margins[0].data.table, model.boosters.data.table)
+
+
+def test_everything_is_fitted(fitted: JointScanCRF) -> None:
+    fresh = JointScanCRF(MODEL)
+    for name, value in fitted.state_dict().items():
+        assert value.isfinite().all() or name.endswith("thresholds"), name
+    for name in ("boosters.data.table", "boosters.outlier.table", "scales.local", "scales.local_outlier", "scales.pairwise"):
+        assert not torch.equal(fitted.state_dict()[name], fresh.state_dict()[name]), name
+    for one, other in zip(fitted.weight_vectors, fresh.weight_vectors, strict=True):
+        assert (one != other).float().mean() > 0.8
+
+
+def test_the_fit_explains_what_it_has_seen_better(fitted: JointScanCRF, material: list[Material]) -> None:
+    before = copy.deepcopy(fitted)
+    before.reset_parameters()
+    generator = torch.Generator().manual_seed(LEARNING.seed)
+    lessons = [prepare(fitted, part, LEARNING, generator) for part in material]
+    for chains in ("matching", "clustering"):
+        config = replace(MODEL, chains=chains)
+        with torch.no_grad():
+            old, new = (
+                sum(float(pseudo_log_likelihood(lesson.view, lesson.plugins, model.fitted, config).sum()) for lesson in lessons)
+                for model in (before, fitted)
+            )
+        assert new > 0.8 * old, chains  # both are negative
+
+
+def test_a_fit_can_be_repeated(fitted: JointScanCRF, material: list[Material]) -> None:
+    again = JointScanCRF(MODEL)
+    torch.manual_seed(321)
+    fit(again, material, LEARNING)
+    for name, value in fitted.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value), name
+
+
+@pytest.mark.parametrize("layer", [MatchingCRF, ClusteringCRF])
+def test_one_chain_alone_is_fitted_alone(layer: type[JointScanCRF], material: list[Material]) -> None:
+    model, fresh = layer(MODEL), layer(MODEL)
+    seen: dict[str, int] = {}
+
+    def watch(chain: str) -> None:
+        seen[chain] = seen.get(chain, 0) + 1
+
+    callbacks = {chain: lambda *_, chain=chain: watch(chain) for chain in ("association", "clustering")}
+    fit(model, material[:2], LEARNING, callbacks)
+    own, other = ("association", "clustering") if layer is MatchingCRF else ("clustering", "association")
+    assert list(seen) == [own]
+    for name, weight in getattr(fresh, f"{other}_weights").items():
+        assert torch.equal(getattr(model, f"{other}_weights")[name], weight), name
+    assert any(not torch.equal(getattr(model, f"{own}_weights")[name], w) for name, w in getattr(fresh, f"{own}_weights").items())
+
+
+def test_the_literal_reading_learns_no_raw_weight(material: list[Material]) -> None:
+    model = MatchingCRF(replace(MODEL, features=FeatureConfig(raw_channels=False, stumps=10)))
+    fit(model, material[:2], LEARNING)
+    learned = model.weight_vectors[0].detach()
+    assert (learned[: len(LOCAL_CHANNELS)] == 0).all()
+    assert (learned[len(LOCAL_CHANNELS) :] != 0).any()
+    assert all(model.association_weights[name].item() == 0 for name in LOCAL_CHANNELS)
+
+
+def test_set_weights_follows_the_names() -> None:
+    model = JointScanCRF()
+    set_weights(model, "association", torch.arange(18.0))
+    set_weights(model, "clustering", torch.arange(12.0))
+    assert [model.association_weights[name].item() for name in ASSOCIATION_WEIGHTS] == list(range(18))
+    assert [model.clustering_weights[name].item() for name in CLUSTERING_WEIGHTS] == list(range(12))
+    with pytest.raises(ValueError, match="zip"):
+        set_weights(model, "clustering", torch.arange(18.0))

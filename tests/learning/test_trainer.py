@@ -1,0 +1,136 @@
+"""One training run from the command to its run folder, on six pairs."""
+
+import importlib.util
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from torchcrf_scan.config import DataConfig
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
+from torchcrf_scan.learning.trainer import load_data, pairs_to_draw, refuse_leaks, versions
+from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.scan import Scan, ScanPair
+
+ROOT = Path(__file__).resolve().parents[2]
+METHODS = ("joint", "CRF-Matching", "CRF-Clustering")
+SMALL = ("--data.pairs=6", "--data.sequences=3", "--learning.folds=2", "--model.features.stumps=15", "--learning.max_steps=40")
+
+
+def load_main() -> Callable[[list[str]], None]:
+    spec = importlib.util.spec_from_file_location("train", ROOT / "train.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    main: Callable[[list[str]], None] = module.main
+    return main
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "small"
+    load_main()([*SMALL, f"--output={folder}"])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def events(run: Path) -> EventAccumulator:
+    accumulator = EventAccumulator(str(run / "events"), size_guidance={"scalars": 0, "images": 0})
+    accumulator.Reload()
+    return accumulator
+
+
+def test_the_run_folder_is_complete(run: Path) -> None:
+    names = {path.name for path in run.iterdir()}
+    assert {"config.yaml", "versions.json", "metrics.json", "tables.md", "model", "pictures", "events"} <= names
+    assert not any(name.startswith(".") for name in names)
+    pictures = list((run / "pictures").glob("*.png"))
+    assert len(pictures) == 3
+    assert all(picture.stat().st_size > 1000 for picture in pictures)
+
+
+def test_the_joint_model_has_learned(run: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert tuple(metrics) == METHODS
+    assert metrics["joint"]["cluster_accuracy"] > 70
+    assert metrics["joint"]["association_accuracy"] > 50
+    assert metrics["joint"]["ego_success"] >= 60
+    assert metrics["joint"]["association_accuracy"] > metrics["CRF-Matching"]["association_accuracy"]
+    for method in METHODS:
+        assert 0 <= metrics[method]["cluster_accuracy"] <= 100
+
+
+def test_the_model_can_be_loaded(run: Path) -> None:
+    model = JointScanCRF.from_pretrained(run / "model")
+    assert model.config.features.stumps == 15
+    assert float(model.boosters.data.table.abs().max()) > 0
+
+
+def test_the_config_is_the_resolved_one(run: Path) -> None:
+    text = (run / "config.yaml").read_text()
+    for line in ("pairs: 6", "stumps: 15", "max_steps: 40", "schedule: sweep"):
+        assert line in text
+
+
+def test_tables_name_every_method(run: Path) -> None:
+    text = (run / "tables.md").read_text()
+    assert text.count("Table") >= 3
+    assert all(f"| {method} |" in text for method in METHODS)
+
+
+def test_versions_are_noted(run: Path) -> None:
+    assert json.loads((run / "versions.json").read_text()) == versions()
+    assert {"python", "torch", "numpy", "scikit-learn", "scipy", "torchcrf-scan", "git"} <= set(versions())
+
+
+@pytest.mark.parametrize("tag", ["joint/association", "joint/clustering", "matching/association", "clustering/clustering"])
+def test_every_step_of_the_fit_is_logged(events: EventAccumulator, tag: str) -> None:
+    losses = [event.value for event in events.Scalars(f"objective/{tag}")]
+    assert len(losses) > 1
+    assert losses[-1] < losses[0]
+    assert len(events.Scalars(f"gradient/{tag}")) == len(losses)
+    names = ASSOCIATION_WEIGHTS if tag.endswith("association") else CLUSTERING_WEIGHTS
+    assert all(len(events.Scalars(f"weights/{tag}/{name}")) == len(losses) for name in names)
+
+
+def test_the_last_logged_weights_are_the_models(run: Path, events: EventAccumulator) -> None:
+    model = JointScanCRF.from_pretrained(run / "model")
+    for name in ASSOCIATION_WEIGHTS:
+        logged = events.Scalars(f"weights/joint/association/{name}")[-1].value
+        assert logged == pytest.approx(model.association_weights[name].item(), rel=1e-4, abs=1e-5), name
+
+
+def test_metrics_and_pictures_are_logged(run: Path, events: EventAccumulator) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    for method in METHODS:
+        for name in ("association_accuracy", "cluster_accuracy", "ego_success"):
+            logged = events.Scalars(f"test/{name}/{method}")[0].value
+            assert logged == pytest.approx(metrics[method][name], rel=1e-4)
+    assert len(events.Images("pair")) == 3
+
+
+def named(*sequences: str) -> list[ScanPair]:
+    scan = Scan.from_ranges([1.0], [0.0])
+    return [ScanPair(scan, scan, sequence=sequence, name=f"{sequence}{k}") for k, sequence in enumerate(sequences)]
+
+
+def test_a_sequence_on_both_sides_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected no sequence in both training and test pairs, got b, c"):
+        refuse_leaks(named("a", "b", "c"), named("c", "d", "b"))
+    refuse_leaks(named("a", "b"), named("c"))
+    assert pairs_to_draw(named("a", "a", "b", "a", "c"), most=2) == [0, 2]
+
+
+def test_simulated_training_and_test_pairs_share_nothing() -> None:
+    train, test = load_data(DataConfig(simulate_train=("street", "indoor"), simulate_test=("street",), pairs=2, sequences=2))
+    assert (len(train), len(test)) == (4, 2)
+    refuse_leaks(train, test)
+    assert len({pair.sequence for pair in train}) == 4
+
+
+def test_no_test_pair_is_no_error() -> None:
+    train, test = load_data(DataConfig(simulate_test=(), pairs=1, sequences=1))
+    assert (len(train), len(test)) == (1, 0)
