@@ -25,7 +25,7 @@ class SimulatorConfig:
         ego_rotation: largest turn of the sensor per pair, radians.
         movers_min: least number of moving objects; a pair has fewer where some are out of sight.
         movers_max: largest number of moving objects.
-        clutter: amount of hedges, bushes and low crowns, whose returns are not repeatable; 1 is an ordinary street.
+        clutter: amount of hedges, bushes and low crowns, whose returns are not repeatable; 2 is an ordinary street.
         dominant_mover: probability that a truck drives beside the sensor and fills 40 to 50 % of the returns of a sequence.
         aperture: probability that a car is seen along one side only and slides along it.
         scale: factor on the whole world and on every motion, but not on the sensor; 0.1 imitates 1:10 model cars.
@@ -38,14 +38,14 @@ class SimulatorConfig:
     range_max: float = 80.0
     range_noise: float = 0.015
     dropout: float = 0.02
-    mixed_pixels: float = 0.06
+    mixed_pixels: float = 0.12
     vibration: float = 0.005
     dt: float = 0.2
     ego_translation: float = 2.0
     ego_rotation: float = 0.15
     movers_min: int = 1
     movers_max: int = 4
-    clutter: float = 1.0
+    clutter: float = 2.0
     dominant_mover: float = 0.0
     aperture: float = 0.0
     scale: float = 1.0
@@ -74,7 +74,7 @@ class SimulatorConfig:
 MODEL_CARS = SimulatorConfig(beams=360, fov=360.0, range_max=9.0, dropout=0.3, scale=0.1, ego_translation=4.0, ego_rotation=0.25)
 WORLDS = {
     "street": SimulatorConfig(),
-    "fast_street": SimulatorConfig(ego_translation=4.0, beams=361, range_noise=0.03, clutter=2.0),
+    "fast_street": SimulatorConfig(ego_translation=4.0, range_noise=0.03, clutter=3.0),
     "model_cars": MODEL_CARS,
     "model_cars_dominant": replace(MODEL_CARS, dominant_mover=0.5, aperture=0.5),
     "indoor": SimulatorConfig(scene="indoor", range_max=30.0, ego_translation=0.4),
@@ -101,7 +101,7 @@ class InferenceConfig:
         temperature: 0 = max-product, 1 = sum-product.
         motion_weights: `hard` (labels, the paper's) or `soft` (beliefs; lets gradients reach the weights).
         motion_metric: `point` (Kabsch, the paper's) or `line` (robust point-to-line step).
-        min_extent: metres; a cluster smaller than this takes the background's rotation.
+        min_extent: metres (in the unit `spacing`, those of a street scanner); a smaller cluster takes the background's rotation.
         rotation_tolerance: radians below which a motion has settled.
         translation_tolerance: metres below which a motion has settled.
     """

@@ -105,7 +105,8 @@ def test_ascending_iterations_are_exact_after_as_many_as_there_are_nodes(chains:
 @pytest.mark.parametrize("order", ["alternate", "ascending"])
 @pytest.mark.parametrize("chains", CHAINS)
 def test_nothing_is_settled_before_every_message_has_arrived(chains: str, order: str) -> None:
-    batch, start, parameters = random_case(chains, 16)
+    batch, start, parameters = random_case(chains, 32)
+    parameters = replace(parameters, association=normal(18, seed=6) / 2, clustering=normal(12, seed=106) / 2)
     settings = {"clusters": start.motions.shape[1] + 1, "candidates": 3}
     view = PairView.of(batch)
     exact = joint.decode(view, start, parameters, config(chains, **settings, iterations=1))

@@ -297,6 +297,16 @@ def test_without_an_early_stop_every_round_is_done(iterations: int, monkeypatch:
     assert found.iterations.tolist() == [iterations]
 
 
+def test_no_round_leaves_the_start() -> None:
+    batch, _ = scene(16)
+    start = make_start(batch, MOTIONS)
+    found = decode(batch, start, config(clusters=4, iterations=0))
+    assert torch.equal(found.association, start.association)
+    assert_close(found.motions, start.motions)
+    assert found.iterations.tolist() == [0]
+    assert_sane(found, batch)
+
+
 def test_early_stop_saves_rounds() -> None:
     batch, _ = scene(16)
     found = decode(batch, make_start(batch, MOTIONS), config(clusters=4, iterations=30))

@@ -34,6 +34,8 @@ from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.messages import chain_beliefs
 from torchcrf_scan.inference.motion import Motions, estimate, hard_support, soft_support
 
+ROBUST_SHARE = 0.3  # of a point's usual residual: across a surface errors are smaller than from point to point
+
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
@@ -184,7 +186,7 @@ def update_motions(view: PairView, start: Start, state: State, parameters: Param
     support = hard_support(*geometry, state.association, state.cluster, state.motions.value.shape[1])
     if config.motion_weights == "soft":
         support = soft_support(*geometry, support, state.candidates, state.log_association, state.log_cluster)
-    scale = parameters.scales.cluster_distance
+    scale = ROBUST_SHARE * parameters.scales.cluster_distance
     motions = estimate(batch.source, support, state.motions, metric=config.motion_metric, scale=scale, min_extent=config.min_extent)
     return replace(state, motions=motions)
 
