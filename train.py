@@ -26,7 +26,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--config", action="config", help="YAML file of settings")
     parser.add_class_arguments(Config)
     settings = parser.parse_args(argv)
-    config = Config(**{k: v for k, v in parser.instantiate(settings).items() if k != "config"})
+    try:
+        config = Config(**{k: v for k, v in parser.instantiate(settings).items() if k != "config"})
+    except ValueError as error:
+        parser.error(str(error))
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     folder = Path(config.output)

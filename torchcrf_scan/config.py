@@ -139,7 +139,7 @@ class FeatureConfig:
         raw_channels: the 12 local channels enter the potentials beside the boosted scores (W-A); off, they only feed the boosters
             (W-B, the literal text).
         wrap_closed: neighbours wrap round a closed scan (A-06); off, they clamp as in the paper.
-        length_unit: what lengths are measured in: `spacing` (what each pair's own scans resolve, so that one set of weights serves a
+        length_unit: what lengths are measured in: `spacing` (what each pair's own scans resolve, so one set of weights serves a
             street and a table top) or `metre`, the paper's.
         stumps: decision stumps in each booster.
     """

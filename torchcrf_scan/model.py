@@ -35,7 +35,8 @@ class JointScanCRF(nn.Module):
 
     Gradients reach the weights and the points through log-beliefs and, with `inference.motion_weights = soft`, through the motions,
     at fixed candidates and away from kinks (ties, capped errors). Without gradient: the labels, the start, the choice of
-    candidates, and the boosted scores, which are steps.
+    candidates, the unit of length, and the boosted scores, which are steps. The `flooding` schedule has no gradient at all and fits
+    its motions by Eq. 6 on hard labels whatever `motion_metric` and `motion_weights` say.
     """
 
     association_weights: nn.ParameterDict
@@ -44,8 +45,8 @@ class JointScanCRF(nn.Module):
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__()
         self.config = config or ModelConfig()
-        self.association_weights = nn.ParameterDict({name: torch.zeros(()) for name in ASSOCIATION_WEIGHTS})
-        self.clustering_weights = nn.ParameterDict({name: torch.zeros(()) for name in CLUSTERING_WEIGHTS})
+        self.association_weights = nn.ParameterDict([(name, nn.Parameter(torch.zeros(()))) for name in ASSOCIATION_WEIGHTS])
+        self.clustering_weights = nn.ParameterDict([(name, nn.Parameter(torch.zeros(()))) for name in CLUSTERING_WEIGHTS])
         self.scales = Scales()
         self.boosters = Boosters(self.config.features.stumps)
         self.hypothesis_score = HypothesisScore()
@@ -119,6 +120,8 @@ class JointScanCRF(nn.Module):
             raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
         view = self.view(batch)
         plugins = plugins or pseudo_likelihood.true_plugins(view.batch, self.config.inference.clusters - 1)
+        if self.config.chains == "matching":
+            plugins = pseudo_likelihood.for_background_alone(plugins)
         return pseudo_likelihood.pseudo_log_likelihood(view, plugins, self.fitted, self.config)
 
     @torch.no_grad()

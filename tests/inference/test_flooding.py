@@ -12,7 +12,7 @@ from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import Scales
-from torchcrf_scan.inference import flooding, joint
+from torchcrf_scan.inference import flooding, joint, motion
 from torchcrf_scan.inference.initialise import Start, nearest_association
 from torchcrf_scan.inference.joint import Parameters
 from torchcrf_scan.inference.motion import Motions, RunningSums
@@ -63,7 +63,7 @@ def standing(monkeypatch: pytest.MonkeyPatch) -> None:
         return previous.value
 
     monkeypatch.setattr(RunningSums, "motions", unmoved)
-    monkeypatch.setattr(flooding, "PATIENCE", 1000)
+    monkeypatch.setattr(motion, "PATIENCE", 1000)
 
 
 def beliefs_of(found: Prediction, chains: str) -> Tensor:

@@ -17,6 +17,7 @@ from torchcrf_scan.inference.motion import (
     estimate,
     hard_support,
     largest_spread,
+    retire_empty,
     soft_support,
 )
 
@@ -51,7 +52,8 @@ def given_support(source: Tensor, partner: Tensor, labels: Tensor, clusters: int
 
 def refit(source: Tensor, support: Support, previous: Motions, metric: str, *, times: int = 1, min_extent: float = 0.1) -> Motions:
     for _ in range(times):
-        previous = estimate(source, support, previous, metric=metric, scale=SCALE, min_extent=min_extent)
+        fitted = estimate(source, support, previous, metric=metric, scale=SCALE, min_extent=min_extent)
+        previous = retire_empty(fitted, support.count)
     return previous
 
 

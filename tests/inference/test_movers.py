@@ -219,12 +219,12 @@ def test_labels_of_hypotheses() -> None:
     assert label_hypotheses(pool, source, body, motions, torch.tensor(0.1)).tolist() == [-1, -1, 0, 0]
 
 
-def test_fit_needs_annotated_pairs_with_movers() -> None:
+def test_fit_needs_annotated_pairs_and_keeps_the_default_without_movers() -> None:
     pair = simulate_pairs(SimulatorConfig(), 1, 1, 0)[0]
     with pytest.raises(ValueError, match="annotated"):
         fit_hypothesis_score([ScanPair(pair.source, pair.target)])
-    with pytest.raises(ValueError, match="movers"):
-        fit_hypothesis_score([])
+    without_movers = fit_hypothesis_score([])
+    assert all(torch.equal(a, b) for a, b in zip(without_movers.buffers(), HypothesisScore().buffers(), strict=True))
 
 
 def test_a_small_fit_ranks_unseen_hypotheses_and_repeats_itself() -> None:

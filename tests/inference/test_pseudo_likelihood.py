@@ -14,6 +14,7 @@ from torchcrf_scan.batch import ScanPairBatch, Truth
 from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.features.boosting import StumpEnsemble
+from torchcrf_scan.features.candidates import with_targets
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
@@ -27,7 +28,6 @@ from torchcrf_scan.inference.pseudo_likelihood import (
     for_background_alone,
     pseudo_log_likelihood,
     true_plugins,
-    with_truth,
 )
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
 
@@ -322,14 +322,14 @@ def test_without_truth_there_is_none() -> None:
 def test_the_truth_is_among_the_candidates() -> None:
     index = torch.tensor([[[1, 3, 5], [1, 3, 5], [1, 3, 5], [0, 0, 0]]])
     mask = torch.tensor([[[True, True, True]] * 2 + [[True, True, False], [False, False, False]]])
-    found, is_real, label = with_truth(index, mask, torch.tensor([[3, 7, 5, -1]]))
+    found, is_real, label = with_targets(index, mask, torch.tensor([[3, 7, 5, -1]]))
     assert label.tolist() == [[1, 2, 2, 3]]
     assert found[0, :3].tolist() == [[1, 3, 5], [1, 3, 7], [1, 3, 5]]
     assert is_real.tolist() == [[[True] * 3] * 3 + [[False] * 3]]
 
 
 def test_a_masked_candidate_does_not_pass_for_the_truth() -> None:
-    found, is_real, label = with_truth(torch.tensor([[[4, 0]]]), torch.tensor([[[True, False]]]), torch.tensor([[0]]))
+    found, is_real, label = with_targets(torch.tensor([[[4, 0]]]), torch.tensor([[[True, False]]]), torch.tensor([[0]]))
     assert found.tolist() == [[[4, 0]]]
     assert is_real.tolist() == [[[True, True]]]
     assert label.tolist() == [[1]]
@@ -358,5 +358,5 @@ def test_matching_moves_everything_with_the_background() -> None:
 
 def test_matching_is_scored_as_it_is_fitted() -> None:
     batch, model = tiny(), MatchingCRF().double()
-    expected = model.pseudo_log_likelihood(batch, for_background_alone(true_plugins(batch, C)))
+    expected = model.pseudo_log_likelihood(batch, for_background_alone(true_plugins(model.view(batch).batch, C)))
     assert_close(model.pseudo_log_likelihood(batch).detach(), expected.detach())

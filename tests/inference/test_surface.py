@@ -136,7 +136,7 @@ def test_lonely_points_of_a_scan() -> None:
 
 @given(st.floats(0.05, 20), st.integers(2, 60), st.booleans(), st.integers(0, 10_000))
 def test_the_unit_of_length_does_not_matter(scale: float, n: int, closed: bool, seed: int) -> None:
-    smooth = polar(4 + make_points(n, seed)[:, 0] / 6, degrees(-170, 170, n))
+    smooth = polar(4 + make_points(n, seed)[:, 0] / 6, degrees(-170.3, 170.9, n))  # no step is the grazing angle itself
     found, scaled = Surface.of(smooth, NOISE, closed), Surface.of(scale * smooth, scale * NOISE, closed)
     assert torch.equal(scaled.segment, found.segment)
     assert_close(scaled.tangent, found.tangent)

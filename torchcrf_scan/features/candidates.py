@@ -67,6 +67,27 @@ def every_target(source_points: Tensor, target_mask: Tensor) -> tuple[Tensor, Te
     return torch.arange(shape[2], device=target_mask.device).expand(shape), target_mask[:, None].expand(shape)
 
 
+def with_targets(index: Tensor, mask: Tensor, association: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Adds a given target to every point's candidates, in place of the last, and finds it there.
+
+    Args:
+        index, mask: (B, N, K). association: (B, N), -1 outlier.
+
+    Returns:
+        index, mask, and (B, N) the state of that target, K for an outlier.
+    """
+    K = index.shape[-1]
+    is_inlier = association >= 0
+    there = (index == association[..., None]) & mask
+    missing = is_inlier & ~there.any(-1)
+    last = torch.arange(K, device=index.device) == K - 1
+    put = missing[..., None] & last
+    index = torch.where(put, association[..., None], index)
+    mask = mask | put
+    place = ((index == association[..., None]) & mask).int().argmax(-1)
+    return index, mask, torch.where(is_inlier, place, K)
+
+
 def by_score(score: Tensor, target_mask: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Index and mask (B, N, K) of the best `count` targets by a (B, N, M) score: the cold search, when no motion is known."""
     masked = score.masked_fill(~target_mask[:, None], -torch.inf)

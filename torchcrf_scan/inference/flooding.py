@@ -32,7 +32,9 @@ from torchcrf_scan.inference import joint
 from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.joint import Parameters, State
 from torchcrf_scan.inference.messages import normalise, reduce_states
-from torchcrf_scan.inference.motion import PATIENCE, Motions, RunningSums
+from torchcrf_scan.inference.motion import RunningSums, retire_empty
+
+MESSAGE_TOLERANCE = 1e-3
 
 
 @dataclass(slots=True)
@@ -55,12 +57,14 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
     converged = torch.zeros(len(view.batch), dtype=torch.bool, device=view.batch.source.device)
     iterations = torch.zeros(len(view.batch), dtype=torch.int64, device=view.batch.source.device)
     for iteration in range(model.inference.iterations):
-        before = run.state
+        before, said = run.state, run.said()
         run.iterate(descending=model.inference.flooding_order == "alternate" and iteration % 2 == 1)
-        run.state = joint.keep_settled(run.state, before, converged)
-        iterations = iterations + (~converged).long()
-        converged = converged | joint.has_settled(run.state, before, model.inference)
-        if bool(converged.all()):
+        stop_early = model.inference.stop_early
+        if stop_early:
+            run.state = joint.keep_settled(run.state, before, converged)
+        iterations = iterations + (~converged | (not stop_early)).long()
+        converged = converged | (joint.has_settled(run.state, before, model.inference) & run.agrees_with(said))
+        if stop_early and bool(converged.all()):
             break
     return joint.read_out(run.state, converged, iterations)
 
@@ -95,6 +99,19 @@ class Flooding:
                 self.visit_association(i)
         self._retire_empty()
 
+    def said(self) -> list[Tensor]:
+        """All messages as they are now."""
+        both = (self.cluster_messages, self.association_messages)
+        return [message.clone() for messages in both for message in (messages.forward, messages.backward)]
+
+    def agrees_with(self, before: list[Tensor]) -> Tensor:
+        """(B,) whether no message has changed by more than the tolerance (spec 7.6)."""
+        steady = [
+            ((now == then) | ((now - then).abs() < MESSAGE_TOLERANCE)).flatten(1).all(-1)
+            for now, then in zip(self.said(), before, strict=True)
+        ]
+        return torch.stack(steady).all(0)
+
     def visit_cluster(self, i: int, found: Candidates) -> None:
         """Local features, messages to both neighbours, label, motions: one node of the clustering chain."""
         batch, state, scales = self.view.batch, self.state, self.parameters.scales
@@ -112,7 +129,7 @@ class Flooding:
         after = edges[:, k] if k < edges.shape[1] else None
         belief = self._send(self.cluster_messages, i, unary[:, k], before, after)
         log_cluster = state.log_cluster.clone()
-        log_cluster[:, here] = torch.log_softmax(belief, -1)[:, None]
+        log_cluster[:, here] = self._normalised(belief)[:, None]
         cluster = state.cluster.clone()
         cluster[:, here] = joint.cluster_labels(belief[:, None], batch.source_mask[:, here])
         self._relabel(i, replace(state, log_cluster=log_cluster, cluster=cluster))
@@ -130,7 +147,7 @@ class Flooding:
         after = self.edges[:, i] if i < self.edges.shape[1] else None
         belief = self._send(self.association_messages, i, unary, before, after)
         log_association = state.log_association.clone()
-        log_association[:, here] = torch.log_softmax(belief, -1)[:, None]
+        log_association[:, here] = self._normalised(belief)[:, None]
         association = state.association.clone()
         association[:, here] = joint.association_labels(belief[:, None], states.candidates, batch.source_mask[:, here])
         state = replace(state, log_association=log_association, association=association)
@@ -149,6 +166,10 @@ class Flooding:
             said = normalise(reduce_states((unary + messages.backward[:, i])[:, None] + before, 2, temperature))
             messages.backward[:, i - 1] = said.masked_fill(~mask[:, i, None], 0.0)
         return unary + messages.forward[:, i] + messages.backward[:, i]
+
+    def _normalised(self, belief: Tensor) -> Tensor:
+        """Log-beliefs as `chain_beliefs` gives them."""
+        return torch.log_softmax(belief / self.config.temperature if self.config.temperature else belief, -1)
 
     def _relabel(self, i: int, state: State) -> None:
         """ComputeRT after node i took a new label or partner, in O(1) (spec 7.4)."""
@@ -193,9 +214,4 @@ class Flooding:
 
     def _retire_empty(self) -> None:
         """Clusters without a point for two iterations are removed (spec 7.5)."""
-        motions = self.state.motions
-        count = self.sums.value[..., 0].round()
-        empty_for = torch.where(count > 0, 0, motions.empty_for + 1)
-        active = motions.active & (empty_for < PATIENCE)
-        active = torch.cat([torch.ones_like(active[:, :1]), active[:, 1:]], dim=1)
-        self.state = replace(self.state, motions=Motions(motions.value, active, empty_for))
+        self.state = replace(self.state, motions=retire_empty(self.state.motions, self.sums.value[..., 0].round()))

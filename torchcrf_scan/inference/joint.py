@@ -17,7 +17,7 @@ from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features import candidates as candidate_search
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.association import pairwise_features
-from torchcrf_scan.features.candidates import Candidates
+from torchcrf_scan.features.candidates import Candidates, with_targets
 from torchcrf_scan.features.potentials import (
     AssociationStates,
     Boosters,
@@ -32,7 +32,7 @@ from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.messages import chain_beliefs
-from torchcrf_scan.inference.motion import Motions, estimate, hard_support, soft_support
+from torchcrf_scan.inference.motion import Motions, estimate, hard_support, retire_empty, soft_support
 
 ROBUST_SHARE = 0.3  # of a point's usual residual: across a surface errors are smaller than from point to point
 
@@ -80,7 +80,7 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
             after = damp(after, state, older)
             after = keep_settled(after, state, converged)
         older, before, state = before, state, after
-        iterations = iterations + (~converged).long()
+        iterations = iterations + (~converged | (not config.stop_early)).long()
         converged = converged | has_settled(state, before, config)
         if config.stop_early and bool(converged.all()):
             break
@@ -93,21 +93,23 @@ def first_state(view: PairView, start: Start, parameters: Parameters, config: In
     found = find_candidates(view, start.motions, start.active, config)
     at = clustering.correspond(batch.source, batch.target, start.motions, found.nearest, start.association)
     possible = possible_clusters(start.active, start.reach, batch.source.shape[1])
-    fit = -at.residual.masked_fill(~possible[..., :-1], torch.inf)  # (B, N, C)
-    best = fit.argmax(-1)
+    best = at.residual.masked_fill(~possible[..., :-1], torch.inf).argmin(-1)
+    index, mask, place = with_targets(found.index, found.mask, start.association)
     outlier = start.association < 0
-    log_cluster = torch.cat([fit, torch.full_like(fit[..., :1], -torch.inf)], dim=-1)
-    chosen = (found.index == start.association[..., None]) & found.mask
-    chosen = torch.cat([chosen, ~chosen.any(-1, keepdim=True)], dim=-1)
-    log_association = torch.zeros_like(chosen, dtype=fit.dtype).masked_fill(~chosen, -torch.inf)
+    C = start.motions.shape[1]
+
+    def certain(label: Tensor, states: int) -> Tensor:
+        is_label = torch.nn.functional.one_hot(label, states).bool()
+        return torch.zeros_like(is_label, dtype=batch.source.dtype).masked_fill(~is_label, -torch.inf)
+
     return State(
-        Motions.start(start.motions, start.active),
-        start.association,
-        best.masked_fill(outlier, -1),
-        found.index,
-        found.mask,
-        log_association,
-        log_cluster,
+        motions=Motions.start(start.motions, start.active),
+        association=start.association,
+        cluster=best.masked_fill(outlier, -1),
+        candidates=index,
+        candidate_mask=mask,
+        log_association=certain(place, index.shape[-1] + 1),
+        log_cluster=certain(best.masked_fill(outlier, C), C + 1),
     )
 
 
@@ -130,7 +132,13 @@ def step(
         if chains == "matching":
             state = inliers_are_background(state)
         state = update_motions(view, start, state, parameters, config)
-    return state
+    return replace(state, motions=retire_empty(state.motions, count_points(state)))
+
+
+def count_points(state: State) -> Tensor:
+    """(B, C) points with that label and an association."""
+    clusters = torch.arange(state.motions.value.shape[1], device=state.cluster.device)
+    return ((state.cluster[:, None] == clusters[:, None]) & (state.association >= 0)[:, None]).sum(-1)
 
 
 def inliers_are_background(state: State) -> State:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -109,7 +109,7 @@ def estimate(source: Tensor, support: Support, previous: Motions, *, metric: str
     """New motions from the supports, after the rules for small clusters (spec 7.5).
 
     Three or more points with some extent: a full fit. Fewer: the background's rotation, the points' translation. None: the
-    motion stays for two rounds, then the cluster is removed; the background is never removed.
+    motion stays, for two rounds (`retire_empty`). The background with fewer than three points keeps its motion.
 
     Args:
         source: (B, N, 2). metric: `point` (closed-form Kabsch) or `line` (a robust Gauss-Newton step to the target's surface).
@@ -130,17 +130,22 @@ def estimate(source: Tensor, support: Support, previous: Motions, *, metric: str
     small_fit = torch.cat([theta, shift], dim=-1)
     value = torch.where(large[..., None], fitted, torch.where((support.count > 0)[..., None], small_fit, previous.value))
     value = torch.cat([background, value[:, 1:]], dim=1)
-    empty_for = torch.where(support.count > 0, 0, previous.empty_for + 1)
-    active = previous.active & (empty_for < PATIENCE)
+    return replace(previous, value=torch.where(previous.active[..., None], value, previous.value))
+
+
+def retire_empty(motions: Motions, count: Tensor) -> Motions:
+    """Ends a round: clusters without a point for two rounds are removed, the background never. count: (B, C) points."""
+    empty_for = torch.where(count > 0, 0, motions.empty_for + 1)
+    active = motions.active & (empty_for < PATIENCE)
     active = torch.cat([torch.ones_like(active[:, :1]), active[:, 1:]], dim=1)
-    return Motions(torch.where(previous.active[..., None], value, previous.value), active, empty_for)
+    return Motions(motions.value, active, empty_for)
 
 
 def line_fit(points: Tensor, partner: Tensor, support: Support, start: Tensor, scale: Tensor) -> Tensor:
     """One robust point-to-line step from `start`. points, partner: (B, C, N, 2); start: (B, C, 3). Returns (B, C, 3)."""
     moved = se2.apply(start, points)
     tangent = support.tangent[:, None].expand_as(points)
-    distance = (moved - partner).detach()
+    distance = moved - partner
     robust = support.weights / (1 + (distance**2).sum(-1) / scale**2)
     return se2.compose(gauss_newton_step(moved, partner, tangent, robust, ALONG), start)
 

@@ -128,33 +128,12 @@ def _truth_of(batch: ScanPairBatch) -> Truth:
     return batch.truth
 
 
-def with_truth(index: Tensor, mask: Tensor, association: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Adds every true target to the candidates, in place of the last, and finds it there.
-
-    Args:
-        index, mask: (B, N, K). association: (B, N), -1 outlier.
-
-    Returns:
-        index, mask, and (B, N) the state of the truth, K for an outlier.
-    """
-    K = index.shape[-1]
-    is_inlier = association >= 0
-    there = (index == association[..., None]) & mask
-    missing = is_inlier & ~there.any(-1)
-    last = torch.arange(K, device=index.device) == K - 1
-    put = missing[..., None] & last
-    index = torch.where(put, association[..., None], index)
-    mask = mask | put
-    place = ((index == association[..., None]) & mask).int().argmax(-1)
-    return index, mask, torch.where(is_inlier, place, K)
-
-
 def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, count: int) -> Chain:
     """The association chain's 14 + 4 features; states are `count` candidates and the truth, or every target (0)."""
     batch = view.batch
     truth = _truth_of(batch)
     found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, count)
-    index, mask, label = with_truth(found.index, found.mask, truth.association)
+    index, mask, label = candidate_search.with_targets(found.index, found.mask, truth.association)
     states = AssociationStates.of(view, index, mask, scales, boosters)
     C = plugins.motions.shape[1]
     one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), C + 1).to(batch.source.dtype)

@@ -22,9 +22,7 @@ def flatten(designs: Sequence[Design]) -> Design:
 
     def rows(design: Design) -> tuple[Tensor, Tensor, Tensor]:
         own = design.features.shape[2] - 1
-        features, mask, label = (
-            part[design.known] for part in (design.features.detach().double(), design.mask, design.label)
-        )
+        features, mask, label = (part[design.known] for part in (design.features.detach().double(), design.mask, design.label))
         spare = states - design.features.shape[2]  # the outlier stays the last state
         features = torch.cat([features[:, :own], features.new_zeros(len(features), spare, features.shape[2]), features[:, own:]], 1)
         mask = torch.cat([mask[:, :own], mask.new_zeros(len(mask), spare), mask[:, own:]], dim=1)
