@@ -183,7 +183,9 @@ class LearningConfig:
             over-strong pairwise weights (spec 6.5).
         disturbance: units of resolution by which training scans are skewed and bumped, as moving sensors do; 0: as they are.
         start_share: share of the pairs whose features see InitialiseRT's motions instead.
-        predicted_share: share of the pairs whose clustering features see predicted associations (A-28).
+        predicted_share: share of the pairs whose clustering features see predicted associations (A-28). 0, the true ones, for
+            pseudo-likelihood: given its neighbours' true clusters a point learns little else, and movers then fade; a half suits
+            `likelihood`. CRF-Clustering alone always sees predicted ones.
         folds: parts of the training pairs for out-of-fold margins; sequences stay whole. 0: margins on the same pairs (faithful).
         negatives: wrong pairs per true one for the data booster.
         prior: standard deviation s_w of the weights' Gaussian prior, on standardised features.
@@ -196,9 +198,9 @@ class LearningConfig:
     objective: str = "pseudo_likelihood"
     rotation_noise: float = 0.005
     translation_noise: float = 0.02
-    disturbance: float = 1.0
+    disturbance: float = 0.7
     start_share: float = 0.5
-    predicted_share: float = 0.5
+    predicted_share: float = 0.0
     folds: int = 4
     negatives: int = 4
     prior: float = 10.0
