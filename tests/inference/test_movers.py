@@ -9,15 +9,9 @@ from torch import Tensor
 from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.movers import (
-    FEATURES,
-    Hypotheses,
-    HypothesisScore,
-    find_movers,
-    hypothesis_features,
-    hypothesise,
-    select,
-)
+from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
+from torchcrf_scan.inference.hypothesis_features import FEATURES, hypothesis_features
+from torchcrf_scan.inference.movers import HypothesisScore, find_movers, select
 from torchcrf_scan.inference.surface import Surface
 from torchcrf_scan.learning.hypothesis_fit import IGNORED, fit_hypothesis_score, label_hypotheses, simulate_mixture
 from torchcrf_scan.scan import ScanPair

@@ -15,7 +15,9 @@ from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.background import background_pool, unit_length
-from torchcrf_scan.inference.movers import FEATURES, Hypotheses, HypothesisScore, hypothesis_features, hypothesise, select
+from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
+from torchcrf_scan.inference.hypothesis_features import FEATURES, hypothesis_features
+from torchcrf_scan.inference.movers import HypothesisScore, select
 from torchcrf_scan.inference.surface import Surface
 from torchcrf_scan.learning.disturb import bump, skew
 from torchcrf_scan.scan import ScanPair
