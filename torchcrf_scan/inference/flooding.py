@@ -66,7 +66,8 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
         converged = converged | (joint.has_settled(run.state, before, model.inference) & run.agrees_with(said))
         if stop_early and bool(converged.all()):
             break
-    return joint.read_out(run.state, converged, iterations)
+    merged = joint.merge_alike(view, run.state, parameters.scales.cluster_distance)
+    return joint.read_out(merged, converged, iterations)
 
 
 class Flooding:

@@ -34,6 +34,7 @@ from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.messages import chain_beliefs
 from torchcrf_scan.inference.motion import Motions, estimate, hard_support, retire_empty, soft_support
 
+MERGE_ROTATION = 0.01  # radians
 ROBUST_SHARE = 0.3  # of a point's usual residual: across a surface errors are smaller than from point to point
 
 
@@ -84,7 +85,7 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
         converged = converged | has_settled(state, before, config)
         if config.stop_early and bool(converged.all()):
             break
-    return read_out(state, converged, iterations)
+    return read_out(merge_alike(view, state, parameters.scales.cluster_distance), converged, iterations)
 
 
 def first_state(view: PairView, start: Start, parameters: Parameters, config: InferenceConfig) -> State:
@@ -239,6 +240,41 @@ def has_settled(after: State, before: State, config: InferenceConfig) -> Tensor:
     still = (rotation < config.rotation_tolerance) & (translation < config.translation_tolerance)
     still = (still | ~after.motions.active).all(-1)
     return same_labels(after, before) & still
+
+
+def merge_alike(view: PairView, state: State, scale: Tensor) -> State:
+    """Clusters that turn out to be one become the one with the lower number, at the end and only then (spec 7.5).
+
+    They are one when their rotations differ by less than 0.01 rad and, over the points of both, their translations by less than
+    `scale`. A cluster without points is not merged.
+    """
+    motions = state.motions
+    C = motions.value.shape[1]
+    members = torch.nn.functional.one_hot(state.cluster.clamp(min=0), C).to(motions.value) * (state.cluster >= 0)[..., None]
+    moved = se2.apply(motions.value, view.batch.source[:, None])  # (B, C, N, 2)
+    total = members.sum(1)  # (B, C)
+    for low in range(C - 1):
+        for high in range(low + 1, C):
+            rotation, _ = se2.distance(motions.value[:, low], motions.value[:, high])
+            gap = torch.linalg.vector_norm(moved[:, low] - moved[:, high], dim=-1)  # (B, N)
+            apart = torch.stack([(gap * members[..., k]).sum(-1) / total[:, k].clamp(min=1) for k in (low, high)]).amax(0)
+            both = motions.active[:, low] & motions.active[:, high] & (total[:, low] > 0) & (total[:, high] > 0)
+            state = join(state, both & (rotation < MERGE_ROTATION) & (apart < scale), low, high)
+    return state
+
+
+def join(state: State, chosen: Tensor, low: int, high: int) -> State:
+    """Gives cluster `high` to `low` in the pairs where chosen (B,) holds."""
+    cluster = torch.where(chosen[:, None] & (state.cluster == high), low, state.cluster)
+    columns = list(state.log_cluster.unbind(-1))
+    neither = torch.isneginf(columns[low]) & torch.isneginf(columns[high])  # logaddexp has no gradient there
+    together = torch.logaddexp(columns[low].masked_fill(neither, 0.0), columns[high].masked_fill(neither, 0.0))
+    together = together.masked_fill(neither, -torch.inf)
+    columns[low] = torch.where(chosen[:, None], together, columns[low])
+    columns[high] = columns[high].masked_fill(chosen[:, None], -torch.inf)
+    is_high = torch.arange(state.motions.active.shape[1], device=chosen.device) == high
+    active = state.motions.active & ~(chosen[:, None] & is_high)
+    return replace(state, cluster=cluster, log_cluster=torch.stack(columns, -1), motions=replace(state.motions, active=active))
 
 
 def read_out(state: State, converged: Tensor, iterations: Tensor) -> Prediction:
