@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -46,20 +45,38 @@ def fit_chain(chains: Sequence[Chain], live: Tensor, config: LearningConfig, wat
     weights = fit_weights(design, config, watch, live=live)
     if config.objective == "pseudo_likelihood":
         return weights
-    exact = [double(chain) for chain in chains]
-    return fit_weights(
-        design,
-        config,
-        watch,
-        live=live,
-        start=weights,
-        log_likelihood=lambda w: torch.stack([chain.log_likelihood(w).sum() for chain in exact]).sum(),
+    exact = stack(chains)
+    return fit_weights(design, config, watch, live=live, start=weights, log_likelihood=lambda w: exact.log_likelihood(w).sum())
+
+
+def stack(chains: Sequence[Chain]) -> Chain:
+    """Many batches of chains as one, padded, float64 and without a gradient of their own; the outlier stays the last state."""
+    longest = max(chain.unary.shape[1] for chain in chains)
+    states = max(chain.unary.shape[2] for chain in chains)
+
+    def spread(values: Tensor, dims: Sequence[int], length: int) -> Tensor:
+        """Puts spare states before the last one along `dims`, and spare nodes at the end."""
+        for dim in dims:
+            own = values.shape[dim] - 1
+            inliers, outlier = values.split([own, 1], dim)
+            shape = list(values.shape)
+            shape[dim] = states - own - 1
+            values = torch.cat([inliers, values.new_zeros(shape), outlier], dim)
+        shape = list(values.shape)
+        shape[1] = length - shape[1]
+        return torch.cat([values, values.new_zeros(shape)], dim=1)
+
+    def label(chain: Chain) -> Tensor:
+        own = chain.unary.shape[2] - 1
+        return spread(torch.where(chain.label == own, states - 1, chain.label), (), longest)
+
+    return Chain(
+        unary=torch.cat([spread(chain.unary.detach().double(), (2,), longest) for chain in chains]),
+        pairwise=torch.cat([spread(chain.pairwise.detach().double(), (2, 3), longest - 1) for chain in chains]),
+        mask=torch.cat([spread(chain.mask, (2,), longest) for chain in chains]),
+        label=torch.cat([label(chain) for chain in chains]),
+        known=torch.cat([spread(chain.known, (), longest) for chain in chains]),
     )
-
-
-def double(chain: Chain) -> Chain:
-    """The chain with float64 features and without a gradient of their own."""
-    return replace(chain, unary=chain.unary.detach().double(), pairwise=chain.pairwise.detach().double())
 
 
 def fit_weights(
@@ -90,19 +107,20 @@ def fit_weights(
     nodes = max(1, int(design.known.sum()))
     measure = log_likelihood or (lambda weights: design.log_likelihood(weights).sum())
     step = 0
+    latest: dict[str, float] = {}  # of the objective's last call, which is the accepted one when a step ends
 
     def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
         scaled = torch.from_numpy(values).requires_grad_()
         loss = ((scaled**2).sum() / (2 * config.prior**2) - measure(scaled * per_unit)) / nodes
         (slope,) = torch.autograd.grad(loss, scaled)
-        return loss.item(), slope.numpy()
+        latest.update(loss=loss.item(), slope=float(slope.abs().max()))
+        return latest["loss"], slope.numpy()
 
     def look(intermediate_result: OptimizeResult) -> None:
         nonlocal step
         step += 1
         if watch is not None:
-            loss, slope = objective(intermediate_result.x)
-            watch(step, loss, float(np.abs(slope).max()), torch.from_numpy(intermediate_result.x) * per_unit)
+            watch(step, latest["loss"], latest["slope"], torch.from_numpy(intermediate_result.x) * per_unit)
 
     first = torch.zeros_like(per_unit) if start is None else torch.where(per_unit > 0, start / per_unit.clamp(min=1e-12), 0.0)
     options = {"maxiter": config.max_steps, "gtol": config.tolerance, "ftol": 0.0, "maxcor": 10}
