@@ -42,11 +42,19 @@ def fit_chain(chains: Sequence[Chain], live: Tensor, config: LearningConfig, wat
         (W,) float64.
     """
     design = flatten([chain.design() for chain in chains])
-    weights = fit_weights(design, config, watch, live=live)
+    done = 0
+
+    def look(step: int, loss: float, slope: float, weights: Tensor) -> None:
+        nonlocal done
+        done += 1  # the steps of both objectives are one row
+        if watch is not None:
+            watch(done, loss, slope, weights)
+
+    weights = fit_weights(design, config, look, live=live)
     if config.objective == "pseudo_likelihood":
         return weights
     exact = stack(chains)
-    return fit_weights(design, config, watch, live=live, start=weights, log_likelihood=lambda w: exact.log_likelihood(w).sum())
+    return fit_weights(design, config, look, live=live, start=weights, log_likelihood=lambda w: exact.log_likelihood(w).sum())
 
 
 def stack(chains: Sequence[Chain]) -> Chain:
