@@ -218,8 +218,8 @@ class DataConfig:
     """Where annotated pairs come from: files, the simulator, or both.
 
     Attributes:
-        train: files, folders or glob patterns of training pairs.
-        test: files, folders or glob patterns of test pairs.
+        train: a file, folder or glob pattern of training pairs, or a list of them.
+        test: the same for test pairs.
         simulate_train: names of simulated `WORLDS` to train on too, `pairs` pairs each. For other worlds, `torchcrf-scan simulate`
             writes files.
         simulate_test: names of simulated `WORLDS` to test on too; train and test never share a seed.
@@ -228,8 +228,8 @@ class DataConfig:
         seed: of the simulator.
     """
 
-    train: tuple[str, ...] = ()
-    test: tuple[str, ...] = ()
+    train: tuple[str, ...] | str = ()
+    test: tuple[str, ...] | str = ()
     simulate_train: tuple[str, ...] = ("street",)
     simulate_test: tuple[str, ...] = ("street",)
     pairs: int = 31

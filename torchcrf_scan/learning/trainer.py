@@ -70,7 +70,8 @@ def train(config: Config) -> dict[str, list[PairScore]]:
 def load_data(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
     """Training and test pairs: files, then simulated worlds."""
 
-    def load(patterns: tuple[str, ...], worlds: tuple[str, ...], seed: int) -> list[ScanPair]:
+    def load(patterns: tuple[str, ...] | str, worlds: tuple[str, ...], seed: int) -> list[ScanPair]:
+        patterns = (patterns,) if isinstance(patterns, str) else patterns
         pairs = list(PairFiles(*patterns)) if patterns else []
         for k, world in enumerate(worlds):
             pairs += simulate_pairs(WORLDS[world], config.pairs, config.sequences, seed + k)
