@@ -61,7 +61,10 @@ def test_an_empty_scan_is_a_scan(ranges: list[float]) -> None:
         ({"ranges": [1.0], "angle_increment": 0.1}, "bearings: expected either bearings or both"),
         ({"ranges": [1.0], "bearings": [0.0], "angle_min": 0.0, "angle_increment": 0.1}, "bearings: expected either"),
         ({"ranges": [1.0, 1.0], "bearings": [0.0, np.nan]}, "bearings: expected finite numbers, got 1 that are not"),
-        ({"ranges": [1.0, 1.0, 1.0], "bearings": [0.0, 0.2, 0.1]}, "bearings: expected counter-clockwise .* got a step back at 1"),
+        (
+            {"ranges": [1.0, 1.0, 1.0], "bearings": [0.0, 0.2, 0.1]},
+            "bearings: expected counter-clockwise .* got a step back after beam 1",
+        ),
         ({"ranges": [1.0, 1.0], "angle_min": 0.0, "angle_increment": -0.1}, "bearings: expected counter-clockwise"),
     ],
 )

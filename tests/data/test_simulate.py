@@ -191,7 +191,7 @@ def test_what_stands_still_is_static():
 def test_swinging_legs_leave_the_rigid_motion():
     pairs = simulate_pairs(replace(INDOOR, movers_min=3, fov=360.0), 12, 6, 2)
     of_movers = np.concatenate([pair.annotation.cluster[pair.annotation.body > 0] for pair in pairs])
-    assert 0.02 < np.mean(of_movers == -1) < 0.7
+    assert 0.005 < np.mean(of_movers == -1) < 0.7  # the gate covers most of a swing, not all of it
 
 
 def test_counts_of_movers():
