@@ -108,8 +108,8 @@ class Flooding:
     def agrees_with(self, before: list[Tensor]) -> Tensor:
         """(B,) whether no message has changed by more than the tolerance (spec 7.6)."""
         steady = [
-            ((now == then) | ((now - then).abs() < MESSAGE_TOLERANCE)).flatten(1).all(-1)
-            for now, then in zip(self.said(), before, strict=True)
+            ((new == old) | ((new - old).abs() < MESSAGE_TOLERANCE)).flatten(1).all(-1)
+            for new, old in zip(self.said(), before, strict=True)
         ]
         return torch.stack(steady).all(0)
 
