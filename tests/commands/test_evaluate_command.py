@@ -1,0 +1,181 @@
+"""`evaluate`: its figures are those of an independent scorer, its tables have the rows they should."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import fail, run
+
+from torchcrf_scan import JointScanCRF, PairPrediction, ScanPair
+from torchcrf_scan.commands.evaluate import METHODS
+from torchcrf_scan.data.dataset import PairFiles
+from torchcrf_scan.data.pair_file import read_pair, write_pair, write_prediction
+from torchcrf_scan.evaluation.metrics import score_pair
+from torchcrf_scan.evaluation.summary import summarise
+
+ROOT = Path(__file__).resolve().parents[2]
+SCORER = ROOT.parent / "shared" / "tools" / "score.py"
+COLUMNS = {  # of the scorer: key of `summarise`, factor
+    "assoc": ("association_accuracy", 1.0),
+    "assoc2": ("association_within_2", 1.0),
+    "clus": ("cluster_accuracy", 1.0),
+    "oP": ("association_precision", 1.0),
+    "oR": ("association_recall", 1.0),
+    "mvIoU": ("iou_moving", 1.0),
+    "ok": ("ego_success", 1.0),
+    "det": ("movers_found", 1.0),
+    "obj_t": ("found_mover_centroid_median", 1.0),
+}
+SPREADS = {"ego_r": ("ego_rotation", 1e3), "ego_t": ("ego_translation", 1.0)}
+
+
+def guess(pair: ScanPair, seed: int) -> PairPrediction:
+    """The annotation with mistakes."""
+    rng, truth = np.random.default_rng(seed), pair.annotation
+    assert truth is not None
+    association = np.where(rng.random(pair.source.n_beams) < 0.2, -1, truth.association)
+    association[association >= 0] = np.clip(association[association >= 0] + rng.integers(-3, 4), 0, pair.target.n_beams - 1)
+    cluster = np.where(rng.random(len(association)) < 0.15, rng.integers(-1, 3, len(association)), truth.cluster)
+    motions = np.zeros((max(len(truth.motions), 3), 3))
+    motions[: len(truth.motions)] = np.nan_to_num(truth.motions) + rng.normal(0, 0.03, truth.motions.shape)
+    ones = np.ones(len(association))
+    return PairPrediction(association, cluster, motions, ones, ones, True)
+
+
+def score_by_tool(pairs: Path, predictions: Path) -> dict[str, dict]:
+    if not SCORER.is_file():
+        pytest.skip(f"needs the scorer, which is not part of the repository: no {SCORER}")
+    spec = importlib.util.spec_from_file_location("score", SCORER)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.main(str(pairs), str(predictions), as_json=True)
+
+
+def assert_equal_to_tool(figures: dict, pairs: Path, predictions: Path) -> None:
+    expected = score_by_tool(pairs, predictions)
+    groups = {**figures["sequences"], "ALL": figures["all"]}
+    assert groups.keys() == expected.keys()
+    for name, group in groups.items():
+        for column, (key, factor) in COLUMNS.items():
+            value = np.nan if group[key] is None else group[key]
+            assert factor * value == pytest.approx(expected[name][column], abs=1e-9, nan_ok=True), (name, column)
+        for column, (key, factor) in SPREADS.items():
+            spread = [factor * group[f"{key}_{which}"] for which in ("median", "p95")]
+            assert spread == pytest.approx(expected[name][column], abs=1e-9), (name, column)
+
+
+def evaluate(capsys: pytest.CaptureFixture[str], figures: Path, *arguments: object) -> tuple[str, dict]:
+    capsys.readouterr()
+    assert run("evaluate", *arguments, "--json", figures) == 0
+    return capsys.readouterr().out, json.loads(figures.read_text())
+
+
+def test_figures_equal_the_scorers(
+    pairs_dir: Path, predictions_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, figures = evaluate(capsys, tmp_path / "f.json", pairs_dir, "--predictions", predictions_dir)
+    assert_equal_to_tool(figures, pairs_dir, predictions_dir)
+
+
+def test_figures_equal_the_scorers_with_movers_and_mistakes(
+    pairs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed, pair in enumerate(PairFiles(pairs_dir)):
+        write_prediction(tmp_path / f"{pair.name}.npz", guess(pair, seed))
+    _, figures = evaluate(capsys, tmp_path / "f.json", pairs_dir, "--predictions", tmp_path)
+    assert figures["all"]["movers_found"] > 0
+    assert_equal_to_tool(figures, pairs_dir, tmp_path)
+
+
+def test_figures_equal_the_scorers_on_real_pairs(real_pairs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    some = PairFiles(real_pairs_dir).paths[::20]
+    for name in ("pairs", "predictions"):
+        (tmp_path / name).mkdir()
+    for seed, path in enumerate(some):
+        (tmp_path / "pairs" / path.name).symlink_to(path)
+        write_prediction(tmp_path / "predictions" / path.name, guess(read_pair(path), seed))
+    _, figures = evaluate(capsys, tmp_path / "f.json", tmp_path / "pairs", "--predictions", tmp_path / "predictions")
+    assert len(some) == figures["all"]["pairs"] == 5
+    assert_equal_to_tool(figures, tmp_path / "pairs", tmp_path / "predictions")
+
+
+def test_tables_have_a_row_for_every_sequence_and_for_all(
+    pairs_dir: Path, predictions_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("evaluate", pairs_dir, "--predictions", predictions_dir) == 0
+    out = capsys.readouterr().out
+    titles = [line.strip("*").split(":")[0] for line in out.splitlines() if line.startswith("**")]
+    assert titles == ["Overview", "Table I", "Table II", "Table III"]
+    for row in ("predictions, sim3_0", "predictions, sim3_1", "predictions, all"):
+        assert out.count(f"| {row} |") == 4
+
+
+def test_one_sequence_needs_one_row(pairs_dir: Path, predictions_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("evaluate", f"{pairs_dir}/sim_s0_*.npz", "--predictions", predictions_dir) == 0
+    out = capsys.readouterr().out
+    assert out.count("| predictions, all |") == 4
+    assert "sim3_0" not in out
+
+
+def test_running_the_model_gives_the_figures_of_its_files(
+    pairs_dir: Path, predictions_dir: Path, model_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, from_files = evaluate(capsys, tmp_path / "a.json", pairs_dir, "--predictions", predictions_dir)
+    out, from_model = evaluate(capsys, tmp_path / "new" / "b.json", pairs_dir, "--model", model_dir)
+    assert "| joint, all |" in out
+    assert from_model["method"] == "joint"
+    assert from_model["sequences"] == from_files["sequences"]
+    assert from_model["all"] == from_files["all"]
+
+
+@pytest.mark.parametrize("method", ["start", "static"])
+def test_other_methods(pairs_dir: Path, model_dir: Path, tmp_path: Path, method: str, capsys: pytest.CaptureFixture[str]) -> None:
+    out, figures = evaluate(capsys, tmp_path / "f.json", pairs_dir, "--method", method, "--model", model_dir)
+    pairs = list(PairFiles(pairs_dir))
+    answers = METHODS[method](lambda: JointScanCRF.from_pretrained(model_dir))(pairs)
+    expected = summarise([score_pair(pair, answer) for pair, answer in zip(pairs, answers, strict=True)])
+    found = {key: np.nan if value is None else value for key, value in figures["all"].items()}
+    assert found == pytest.approx(expected, nan_ok=True)
+    assert f"| {method}, all |" in out
+
+
+def test_static_needs_no_model(pairs_dir: Path) -> None:
+    assert run("evaluate", pairs_dir, "--method=static", "--model=no_such_model") == 0
+
+
+def test_evaluate_names_the_bad_argument(
+    pairs_dir: Path,
+    predictions_dir: Path,
+    tmp_path: Path,
+    moving_pair: tuple[ScanPair, PairPrediction],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert "joint, start, static" in fail(capsys, "evaluate", pairs_dir, "--method=magic")
+    assert "--predictions" in fail(capsys, "evaluate", pairs_dir, "--predictions", predictions_dir, "--method=joint")
+    assert "none for 4 of 4, the first sim_s0_000.npz" in fail(capsys, "evaluate", pairs_dir, "--predictions", tmp_path)
+    assert "source_ranges" in fail(capsys, "evaluate", predictions_dir, "--predictions", predictions_dir)
+    pair = read_pair(pairs_dir / "sim_s0_000.npz")
+    write_pair(tmp_path / "bare.npz", replace(pair, annotation=None))
+    assert "bare.npz: expected an annotated pair" in fail(capsys, "evaluate", tmp_path / "bare.npz", "--method=static")
+    (tmp_path / "other").mkdir()
+    write_prediction(tmp_path / "other" / "sim_s0_000.npz", moving_pair[1])
+    message = fail(capsys, "evaluate", pairs_dir / "sim_s0_000.npz", "--predictions", tmp_path / "other")
+    assert "sim_s0_000" in message
+
+
+def test_a_closed_pipe_is_no_traceback(pairs_dir: Path) -> None:
+    command = [sys.executable, "-m", "torchcrf_scan.cli", "evaluate", str(pairs_dir), "--method=static"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        errors = process.stderr.read()
+    assert process.returncode == 1
+    assert errors == ""

@@ -1,0 +1,32 @@
+"""`torchcrf-scan plot`: a picture of one pair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torchcrf_scan.commands.arguments import load_model
+from torchcrf_scan.data.pair_file import read_pair, read_prediction
+
+
+def plot(file: str, output: str, *, prediction: str | None = None, model: str | None = None) -> int:
+    """Draws a pair with its prediction, from a file or by a model, and its annotation, as far as they are there.
+
+    Args:
+        file: pair file
+        output: picture (.png) to write
+        prediction: prediction file
+        model: folder of a saved model, or the name of one that the package ships; matches the pair
+    """
+    from torchcrf_scan.viz.plots import plot_pair, save_figure
+
+    if prediction is not None and model is not None:
+        raise ValueError("--prediction: expected no --model beside it, got both")
+    if Path(output).suffix.lower() != ".png":
+        raise ValueError(f"--output: expected a name ending in .png, got {output}")
+    pair = read_pair(file)
+    answer = read_prediction(prediction) if prediction is not None else None
+    if model is not None:
+        answer = load_model(model).match_pairs([pair])[0]
+    save_figure(plot_pair(pair, answer), output)
+    print(f"{pair.name} drawn in {output}")
+    return 0

@@ -1,0 +1,35 @@
+"""Which mover of one answer is which of another, by the points that they share."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from torchcrf_scan.scan import BACKGROUND, Ints
+
+
+def match_movers(cluster: Ints, predicted: Ints) -> dict[int, int]:
+    """Matches movers one to one by maximum total overlap; matches without any overlap are left out (spec 8.2, A-22).
+
+    Clusters enter in the order of their first point, so that their numbers do not matter, not even in a tie.
+
+    Args:
+        cluster: (N,) true labels.
+        predicted: (N,) predicted labels.
+
+    Returns:
+        true mover -> predicted mover.
+    """
+    ids, predicted_ids = movers_in_order(cluster), movers_in_order(predicted)
+    is_true = cluster[None, :] == ids[:, None]  # (K, N)
+    is_predicted = predicted[None, :] == predicted_ids[:, None]  # (L, N)
+    overlap = is_true.astype(np.float64) @ is_predicted.T.astype(np.float64)  # (K, L)
+    rows, columns = linear_sum_assignment(-overlap)
+    return {int(ids[i]): int(predicted_ids[j]) for i, j in zip(rows, columns, strict=True) if overlap[i, j] > 0}
+
+
+def movers_in_order(labels: Ints) -> Ints:
+    """(K,) movers that occur, in the order of their first point."""
+    ids, first = np.unique(labels, return_index=True)
+    ids = ids[np.argsort(first)]
+    return ids[ids > BACKGROUND]

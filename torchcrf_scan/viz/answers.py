@@ -1,0 +1,98 @@
+"""The answers that a figure shows: labels by source beam, movers numbered as the true ones, and the mistakes to ring."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchcrf_scan.counterparts import match_movers
+from torchcrf_scan.scan import BACKGROUND, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
+
+ASSOCIATION_TOLERANCE = 2  # beams: an association this near is drawn as right
+
+
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """One answer for a pair, by source beam, its movers numbered as the annotation's where they match; unknown motions are NaN."""
+
+    association: Ints
+    cluster: Ints
+    motions: Floats
+
+    @property
+    def movers(self) -> Ints:
+        """(K,) numbers of the movers that occur, ascending."""
+        return np.unique(self.cluster[self.cluster > BACKGROUND])
+
+    def motion(self, cluster: int) -> Floats:
+        """(3,) the motion of a cluster, NaN where it is unknown."""
+        return self.motions[cluster] if cluster < len(self.motions) else np.full(3, np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Labels with a name, and which associations and clusters to ring: the prediction's mistakes, None without a truth."""
+
+    name: str
+    labels: Labels
+    wrong_association: Bools | None = None
+    wrong_cluster: Bools | None = None
+
+
+def true_labels(pair: ScanPair) -> Labels | None:
+    """The annotation, None where there is none."""
+    return None if pair.annotation is None else _labels(pair, "annotation", pair.annotation)
+
+
+def predicted_labels(pair: ScanPair, name: str, prediction: PairPrediction, truth: Labels | None) -> Labels:
+    """The prediction, its movers numbered as the true ones; ValueError, which names it, where it does not fit the pair."""
+    labels = _labels(pair, name, prediction)
+    return labels if truth is None else _renumber(labels, truth)
+
+
+def _labels(pair: ScanPair, name: str, given: Annotation | PairPrediction) -> Labels:
+    association, cluster = np.asarray(given.association), np.asarray(given.cluster)
+    motions = np.asarray(given.motions, dtype=np.float64)
+    for key, values in (("association", association), ("cluster", cluster)):
+        if values.shape != (pair.source.n_beams,):
+            raise ValueError(f"{name}.{key}: expected shape ({pair.source.n_beams},), got {values.shape}")
+    if (association >= pair.target.n_beams).any():
+        raise ValueError(f"{name}.association: expected indices below {pair.target.n_beams}, got {association.max()}")
+    return Labels(association, cluster, motions.reshape(-1, 3))
+
+
+def _renumber(labels: Labels, truth: Labels) -> Labels:
+    """Gives every mover the number of the true one it overlaps most (one to one, largest overlap in all), others new numbers."""
+    matched = {theirs: ours for ours, theirs in match_movers(truth.cluster, labels.cluster).items()}
+    first_new = max([len(truth.motions) - 1, *truth.movers.tolist(), 0]) + 1
+    new = {k: first_new + i for i, k in enumerate(k for k in labels.movers.tolist() if k not in matched)}
+    cluster, motions = labels.cluster.copy(), np.full((first_new + len(new), 3), np.nan)
+    motions[BACKGROUND] = labels.motion(BACKGROUND)
+    for old, number in (matched | new).items():
+        cluster[labels.cluster == old] = number
+        motions[number] = labels.motion(old)
+    return Labels(labels.association, cluster, motions)
+
+
+def judge(name: str, drawn: Labels, pair: ScanPair, guess: Labels, truth: Labels) -> Answer:
+    """The labels `drawn` with the mistakes of `guess` to ring; what nobody annotated is never wrong."""
+    assert pair.annotation is not None
+    known = ~pair.annotation.ignore
+    known &= pair.source.to_beams(np.ones(len(pair.source), dtype=bool), False)
+    a, b = guess.association, truth.association
+    near = ((a < 0) & (b < 0)) | ((a >= 0) & (b >= 0) & (np.abs(a - b) <= ASSOCIATION_TOLERANCE))
+    return Answer(name, drawn, known & ~near, known & (guess.cluster != truth.cluster))
+
+
+def all_answers(pair: ScanPair, predictions: Mapping[str, PairPrediction]) -> list[Answer]:
+    """The methods' answers in their order, then the truth; ValueError where there is neither."""
+    truth = true_labels(pair)
+    if truth is None and not predictions:
+        raise ValueError("predictions: expected at least one method for a pair without annotation, got none")
+    answers = []
+    for name, prediction in predictions.items():
+        guess = predicted_labels(pair, name, prediction, truth)
+        answers.append(Answer(name, guess) if truth is None else judge(name, guess, pair, guess, truth))
+    return answers if truth is None else [*answers, Answer("truth", truth)]
