@@ -1,11 +1,24 @@
 import csv
 import io
+import math
 
 import numpy as np
 import pytest
 
-from torchcrf_scan.evaluation.metrics import PairScore, score_pair, summarise
-from torchcrf_scan.evaluation.report import Table, association_table, detection_table, estimation_table, overview_table, report
+from torchcrf_scan.evaluation.bootstrap import Interval, by_blocks, paired_intervals
+from torchcrf_scan.evaluation.metrics import PairScore, score_pair
+from torchcrf_scan.evaluation.report import (
+    PUBLISHED_HEADING,
+    PUBLISHED_NOTE,
+    Table,
+    association_table,
+    detection_table,
+    differences_table,
+    estimation_table,
+    overview_table,
+    report,
+)
+from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
 
 
@@ -56,6 +69,108 @@ def test_overview_has_the_columns_of_the_reference_table(scores: dict[str, list[
         "outlier precision (%)",
         "outlier recall (%)",
     )
+
+
+def test_tables_have_the_columns_of_the_paper_and_more(scores: dict[str, list[PairScore]]) -> None:
+    paper = {"accuracy (%)", "SED1", "SED2", "outliers found (%)", "outliers true (%)", "ratio (%)", "precision (%)"}
+    assert paper | {"within +-1 (%)", "within +-2 (%)"} <= set(association_table(scores).columns)
+    assert paper | {"IoU of moving points (%)", "movers found (%)"} <= set(detection_table(scores).columns)
+    kinds = ("", "background ", "mover ")
+    assert {f"{kind}{of}" for kind in kinds for of in ("rotation (rad)", "translation (m)")} <= set(
+        estimation_table(scores).columns
+    )
+    assert cell(detection_table(scores), "nothing", "movers found (%)") == 0
+    assert cell(association_table(scores), "right", "within +-2 (%)") == 100
+
+
+def test_times_are_medians_in_milliseconds(scores: dict[str, list[PairScore]]) -> None:
+    table = report(scores, seconds={"right": [0.1, 0.3, 5.0], "another": [1.0]})[0]
+    assert table.columns == (*overview_table(scores).columns, "time (ms)")
+    assert cell(table, "right", "time (ms)") == pytest.approx(300)
+    assert math.isnan(cell(table, "nothing", "time (ms)"))
+    assert "time (ms)" in overview_table(scores, seconds={"right": []}).columns
+    assert all("time (ms)" not in other.columns for other in report(scores, seconds={"right": [0.1]})[1:])
+
+
+def test_published_numbers_stand_at_the_right_of_their_row(scores: dict[str, list[PairScore]]) -> None:
+    rows = dict.fromkeys(("ICP", "ICP, tuned", "K-Means (ICP)", "joint"), scores["right"])
+    overview, association, detection, estimation = report(rows, published=True)
+    assert overview == overview_table(rows)
+    assert cell(association, "ICP, tuned", f"{PUBLISHED_HEADING}accuracy (%)") == 69.19
+    assert cell(association, "joint", f"{PUBLISHED_HEADING}SED") == 96.13
+    assert math.isnan(cell(association, "ICP", f"{PUBLISHED_HEADING}ratio (%)"))
+    assert cell(detection, "K-Means (ICP)", f"{PUBLISHED_HEADING}outliers found (%)") == 34.6
+    assert math.isnan(cell(detection, "ICP, tuned", f"{PUBLISHED_HEADING}accuracy (%)"))
+    assert cell(estimation, "joint", f"{PUBLISHED_HEADING}translation (m)") == 0.56
+    for table, number in ((association, 5), (detection, 5), (estimation, 2)):
+        assert sum(column.startswith(PUBLISHED_HEADING) for column in table.columns) == number
+        assert all(column.startswith(PUBLISHED_HEADING) for column in table.columns[-number:])
+        assert f"\n\n{PUBLISHED_NOTE}\n\n| method |" in table.to_markdown()
+
+
+def test_published_numbers_need_a_row_and_a_wish(scores: dict[str, list[PairScore]]) -> None:
+    for asked, plain in zip(report(scores, published=True), report(scores), strict=True):
+        assert asked.to_markdown() == plain.to_markdown()
+    joint = {"joint": scores["right"]}
+    assert all(not column.startswith(PUBLISHED_HEADING) for table in report(joint) for column in table.columns)
+    assert PUBLISHED_NOTE not in association_table(joint).to_markdown()
+
+
+@pytest.fixture
+def drive(scores: dict[str, list[PairScore]]) -> dict[str, list[PairScore]]:
+    """Eight pairs of a drive: joint always right, one that calls all outliers, and one that is right in every other pair."""
+    right, nothing = scores["right"][0], scores["nothing"][0]
+    return {"joint": [right] * 8, "nothing": [nothing] * 8, "sometimes": [right, nothing] * 4, "same": [right] * 8}
+
+
+def test_differences_are_the_paired_intervals(drive: dict[str, list[PairScore]]) -> None:
+    weights = by_blocks(["a"] * 8, 3, 200)
+    table = differences_table("joint", drive, weights)
+    assert table.title == "joint minus each row"
+    assert [row[0] for row in table.rows] == ["nothing", "sometimes", "same"]
+    assert table.columns == ("method", "association within +-2", "cluster accuracy", "IoU of moving points", "movers found")
+    for method in ("nothing", "sometimes", "same"):
+        intervals = paired_intervals(drive["joint"], drive[method], weights)
+        assert cell(table, method, "cluster accuracy") == intervals["cluster_accuracy"]
+        assert cell(table, method, "association within +-2") == intervals["association_within_2"]
+        assert cell(table, method, "movers found") == intervals["movers_found"]
+        assert cell(table, method, "IoU of moving points") == intervals["iou_moving"]
+
+
+def test_differences_read_well_in_markdown(drive: dict[str, list[PairScore]]) -> None:
+    lines = differences_table("joint", drive, by_blocks(["a"] * 8, 3, 200)).to_markdown().splitlines()
+    assert lines[2].startswith("Difference [95 % interval")
+    assert lines[5] == "| --- | ---: | ---: | ---: | ---: |"
+    assert lines[6].startswith("| nothing | +87.5 [87.5, 87.5] * | +87.5 [87.5, 87.5] * | +100.0 [100.0, 100.0] * |")
+    assert lines[8] == "| same |" + " +0.0 [0.0, 0.0] |" * 4
+
+
+def test_differences_have_columns_of_their_own_in_csv() -> None:
+    table = Table(
+        "t", ("method", "found"), (("a", Interval(1.5, -0.25, 3.0)), ("b", Interval(2.0, math.nan, math.nan)), ("c", 4.0))
+    )
+    rows = list(csv.reader(io.StringIO(table.to_csv())))
+    assert rows == [
+        ["method", "found", "found, low", "found, high"],
+        ["a", "1.5", "-0.25", "3.0"],
+        ["b", "2.0", "", ""],
+        ["c", "4.0", "", ""],
+    ]
+
+
+def test_intervals_in_markdown_have_signs_and_marks() -> None:
+    cells = (Interval(-2.04, -3.0, -1.0), Interval(-0.001, -1.0, 0.0), Interval(3.0, math.nan, math.nan))
+    table = Table("t", ("x",), tuple((cell,) for cell in cells), (1,))
+    assert table.to_markdown().splitlines()[4:] == ["| -2.0 [-3.0, -1.0] * |", "| +0.0 [-1.0, 0.0] |", "| +3.0 [-, -] |"]
+
+
+def test_differences_need_the_reference_and_the_same_pairs(drive: dict[str, list[PairScore]]) -> None:
+    weights = by_blocks(["a"] * 8, 3, 10)
+    with pytest.raises(ValueError, match="reference: expected one of 'joint', 'nothing', 'sometimes', 'same', got 'crf'"):
+        differences_table("crf", drive, weights)
+    with pytest.raises(ValueError, match="expected the 8 pairs of `ours`, got 7"):
+        differences_table("joint", drive | {"short": drive["same"][:7]}, weights)
+    assert differences_table("joint", {"joint": drive["joint"]}, weights).rows == ()
 
 
 def test_markdown() -> None:

@@ -1,16 +1,21 @@
-"""Tables of methods: the paper's I (association), II (motion detection), III (motion estimation) and an overview."""
+"""Tables of methods: the paper's I (association), II (motion detection), III (motion estimation), an overview, differences."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
+import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from torchcrf_scan.evaluation.metrics import PairScore, summarise
+from torchcrf_scan.evaluation import published as paper
+from torchcrf_scan.evaluation.bootstrap import Interval, paired_intervals
+from torchcrf_scan.evaluation.metrics import PairScore
+from torchcrf_scan.evaluation.summary import summarise
+from torchcrf_scan.scan import Ints
 
-Cell = str | float
+Cell = str | float | Interval
 Column = tuple[str, str, int]  # heading, key of `summarise`, digits after the point
 
 OVERVIEW: tuple[Column, ...] = (
@@ -22,6 +27,15 @@ OVERVIEW: tuple[Column, ...] = (
     ("outlier precision (%)", "association_precision", 1),
     ("outlier recall (%)", "association_recall", 1),
 )
+DIFFERENCES: tuple[tuple[str, str], ...] = (  # heading, key of `paired_intervals`
+    ("association within +-2", "association_within_2"),
+    ("cluster accuracy", "cluster_accuracy"),
+    ("IoU of moving points", "iou_moving"),
+    ("movers found", "movers_found"),
+)
+PUBLISHED_HEADING = "published, other data: "
+PUBLISHED_NOTE = "The columns 'published, other data' are the paper's numbers for its own pairs, not for those of this table."
+DIFFERENCES_NOTE = "Difference [95 % interval of a paired bootstrap], in percentage points; * where the interval excludes zero."
 
 
 def _label_columns(prefix: str) -> tuple[Column, ...]:
@@ -42,10 +56,15 @@ def _label_columns(prefix: str) -> tuple[Column, ...]:
 ASSOCIATION: tuple[Column, ...] = (
     *_label_columns("association"),
     ("within +-1 (%)", "association_within_1", 2),
+    ("within +-2 (%)", "association_within_2", 2),
     ("inliers only (%)", "association_inlier_accuracy", 2),
     ("target distance (m)", "target_distance", 3),
 )
-DETECTION: tuple[Column, ...] = _label_columns("cluster")
+DETECTION: tuple[Column, ...] = (
+    *_label_columns("cluster"),
+    ("IoU of moving points (%)", "iou_moving", 2),
+    ("movers found (%)", "movers_found", 2),
+)
 ESTIMATION: tuple[Column, ...] = (
     ("rotation (rad)", "motion_rotation", 4),
     ("translation (m)", "motion_translation", 3),
@@ -69,8 +88,9 @@ class Table:
     Attributes:
         title: what it shows.
         columns: C headings.
-        rows: of C cells each, texts or numbers; NaN where there is nothing to tell.
+        rows: of C cells each, texts, numbers or differences with their intervals; NaN where there is nothing to tell.
         digits: digits after the point per column, for `to_markdown`; none given: 2.
+        note: what one has to know to read it.
 
     Raises:
         ValueError: a row or `digits` of another length than `columns`.
@@ -80,6 +100,7 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
     digits: tuple[int, ...] = ()
+    note: str = ""
 
     def __post_init__(self) -> None:
         for name, length in [*((f"row {i}", len(row)) for i, row in enumerate(self.rows)), ("digits", len(self.digits))]:
@@ -87,52 +108,116 @@ class Table:
                 raise ValueError(f"{name}: expected {len(self.columns)} entries, one per column, got {length}")
 
     def to_markdown(self) -> str:
-        """The title and a pipe table, numbers rounded and flush right, `-` for NaN."""
+        """Title, note and a pipe table: numbers rounded and flush right, `-` for NaN, `*` at intervals that exclude zero."""
         digits = self.digits or (2,) * len(self.columns)
-        is_text = [any(isinstance(row[i], str) for row in self.rows) for i in range(len(self.columns))]
         cells = [[_rounded(cell, n) for cell, n in zip(row, digits, strict=True)] for row in self.rows]
-        lines = [[_escaped(column) for column in self.columns], ["---" if text else "---:" for text in is_text], *cells]
-        return f"**{_escaped(self.title)}**\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+        rule = ["---" if is_text else "---:" for is_text in self._columns_with(str)]
+        lines = [[_escaped(column) for column in self.columns], rule, *cells]
+        above = "".join(f"{text}\n\n" for text in (f"**{_escaped(self.title)}**", self.note) if text)
+        return above + "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
     def to_csv(self) -> str:
-        """Headings and rows as comma-separated values with all digits, empty for NaN; the title is left out."""
+        """Headings and rows as comma-separated values with all digits, empty for NaN; title and note are left out.
+
+        A column of differences becomes three: itself, `<heading>, low` and `<heading>, high`.
+        """
+        wide = self._columns_with(Interval)
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(self.columns)
-        writer.writerows(["" if _is_nan(cell) else cell for cell in row] for row in self.rows)
+        headings = (((name, f"{name}, low", f"{name}, high") if w else (name,)) for name, w in zip(self.columns, wide, strict=True))
+        writer.writerow([heading for group in headings for heading in group])
+        writer.writerows([field for cell, w in zip(row, wide, strict=True) for field in _fields(cell, w)] for row in self.rows)
         return out.getvalue()
 
-
-def overview_table(scores: Mapping[str, Sequence[PairScore]]) -> Table:
-    """One row per method with the figures one looks at first. Raises ValueError for a method without scores."""
-    return _table("Overview", OVERVIEW, scores)
-
-
-def association_table(scores: Mapping[str, Sequence[PairScore]]) -> Table:
-    """The paper's Table I: data association. Raises ValueError for a method without scores."""
-    return _table("Table I: data association", ASSOCIATION, scores)
+    def _columns_with(self, kind: type) -> list[bool]:
+        """Whether each column has a cell of this kind."""
+        return [any(isinstance(row[i], kind) for row in self.rows) for i in range(len(self.columns))]
 
 
-def detection_table(scores: Mapping[str, Sequence[PairScore]]) -> Table:
-    """The paper's Table II: motion detection. Raises ValueError for a method without scores."""
-    return _table("Table II: motion detection", DETECTION, scores)
+Scores = Mapping[str, Sequence[PairScore]]
 
 
-def estimation_table(scores: Mapping[str, Sequence[PairScore]]) -> Table:
-    """The paper's Table III: motion estimation, correctly clustered objects only. Raises ValueError for a method without scores."""
-    return _table("Table III: motion estimation", ESTIMATION, scores)
-
-
-def report(scores: Mapping[str, Sequence[PairScore]]) -> list[Table]:
-    """The overview and the Tables I, II, III of `{method: its scores}`, methods in the given order.
+def overview_table(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | None = None) -> Table:
+    """One row per method with the figures one looks at first, and the median of its `seconds`, the times of its pairs, if given.
 
     Raises:
         ValueError: a method without scores.
     """
-    return [overview_table(scores), association_table(scores), detection_table(scores), estimation_table(scores)]
+    table = _table("Overview", OVERVIEW, scores)
+    if seconds is None:
+        return table
+    times = {method: (1e3 * statistics.median(of_method),) for method, of_method in seconds.items() if len(of_method)}
+    return _widened(table, (("time (ms)", 0),), times)
 
 
-def _table(title: str, columns: Sequence[Column], scores: Mapping[str, Sequence[PairScore]]) -> Table:
+def association_table(scores: Scores, *, published: bool = False) -> Table:
+    """The paper's Table I: data association, beside the paper's numbers if asked for.
+
+    Raises:
+        ValueError: a method without scores.
+    """
+    table = _table("Table I: data association", ASSOCIATION, scores)
+    return _with_published(table, paper.ASSOCIATION) if published else table
+
+
+def detection_table(scores: Scores, *, published: bool = False) -> Table:
+    """The paper's Table II: motion detection, beside the paper's numbers if asked for.
+
+    Raises:
+        ValueError: a method without scores.
+    """
+    table = _table("Table II: motion detection", DETECTION, scores)
+    return _with_published(table, paper.DETECTION) if published else table
+
+
+def estimation_table(scores: Scores, *, published: bool = False) -> Table:
+    """The paper's Table III: motion estimation, correctly clustered objects only, beside the paper's numbers if asked for.
+
+    Raises:
+        ValueError: a method without scores.
+    """
+    table = _table("Table III: motion estimation", ESTIMATION, scores)
+    return _with_published(table, paper.ESTIMATION) if published else table
+
+
+def report(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | None = None, published: bool = False) -> list[Table]:
+    """The overview and the Tables I, II, III of `{method: its scores}`, methods in the given order.
+
+    Args:
+        scores: of the pairs, by method.
+        seconds: the time of every pair, by method, for the overview; `-` for a method that is missing.
+        published: adds the paper's numbers at the right of Tables I to III where a row has some.
+
+    Raises:
+        ValueError: a method without scores.
+    """
+    tables = (association_table, detection_table, estimation_table)
+    return [overview_table(scores, seconds=seconds), *(table(scores, published=published) for table in tables)]
+
+
+def differences_table(reference: str, scores: Scores, weights: Ints) -> Table:
+    """How much better one method is than each other one on the same pairs, with 95 % intervals; percentage points.
+
+    Args:
+        reference: the method that the others are taken from.
+        scores: of the same P pairs in the same order, by method.
+        weights: (R, P) resamples of the pairs, of `bootstrap.by_sequence` or `bootstrap.by_blocks`.
+
+    Raises:
+        ValueError: an unknown `reference`, scores of other pairs, or weights of another shape.
+    """
+    if reference not in scores:
+        raise ValueError(f"reference: expected one of {', '.join(map(repr, scores))}, got {reference!r}")
+    rows: list[tuple[Cell, ...]] = []
+    for method, of_method in scores.items():
+        if method != reference:
+            intervals = paired_intervals(scores[reference], of_method, weights)
+            rows.append((method, *(intervals[key] for _, key in DIFFERENCES)))
+    headings = ("method", *(heading for heading, _ in DIFFERENCES))
+    return Table(f"{reference} minus each row", headings, tuple(rows), (0, *[1] * len(DIFFERENCES)), DIFFERENCES_NOTE)
+
+
+def _table(title: str, columns: Sequence[Column], scores: Scores) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for method, of_method in scores.items():
         if not of_method:
@@ -143,14 +228,47 @@ def _table(title: str, columns: Sequence[Column], scores: Mapping[str, Sequence[
     return Table(title, headings, tuple(rows), (0, *(digits for _, _, digits in columns)))
 
 
-def _is_nan(cell: Cell) -> bool:
-    return not isinstance(cell, str) and math.isnan(cell)
+def _with_published(table: Table, published: paper.PublishedTable) -> Table:
+    """The table with the paper's columns at the right, unchanged when no row has published numbers."""
+    if not any(row[0] in published.rows for row in table.rows):
+        return table
+    columns = [(PUBLISHED_HEADING + heading, digits) for heading, digits in published.columns]
+    return replace(_widened(table, columns, published.rows), note=PUBLISHED_NOTE)
+
+
+def _widened(table: Table, columns: Sequence[tuple[str, int]], cells: Mapping[str, tuple[float, ...]]) -> Table:
+    """The table with more columns (heading, digits) at the right: the cells of each row's method, NaN where it has none."""
+    nothing = (math.nan,) * len(columns)
+    return replace(
+        table,
+        columns=(*table.columns, *(heading for heading, _ in columns)),
+        rows=tuple((*row, *cells.get(str(row[0]), nothing)) for row in table.rows),
+        digits=(*table.digits, *(digits for _, digits in columns)),
+    )
+
+
+def _fields(cell: Cell, is_wide: bool) -> tuple[str | float, ...]:
+    """The CSV fields of a cell, three in a column of differences."""
+    if isinstance(cell, Interval):
+        numbers: tuple[str | float, ...] = (cell.difference, cell.low, cell.high)
+    else:
+        numbers = (cell, "", "") if is_wide else (cell,)
+    return tuple("" if not isinstance(number, str) and math.isnan(number) else number for number in numbers)
 
 
 def _rounded(cell: Cell, digits: int) -> str:
     if isinstance(cell, str):
         return _escaped(cell)
+    if isinstance(cell, Interval):
+        low, high = _rounded(_signless_zero(cell.low, digits), digits), _rounded(_signless_zero(cell.high, digits), digits)
+        mark = " *" if cell.excludes_zero else ""
+        return f"{_signless_zero(cell.difference, digits):+.{digits}f} [{low}, {high}]{mark}"
     return "-" if math.isnan(cell) else f"{cell:.{digits}f}"
+
+
+def _signless_zero(number: float, digits: int) -> float:
+    """The rounded number, zero without the minus that would look like a loss."""
+    return round(number, digits) + 0.0
 
 
 def _escaped(text: str) -> str:

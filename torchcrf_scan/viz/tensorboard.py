@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
+from torchcrf_scan.evaluation.report import Table
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.scan import PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_pair, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class RunLog:
@@ -45,4 +50,12 @@ class RunLog:
         """The pair with its prediction beside the truth: an event and a PNG."""
         figure = plot_pair(pair, prediction)
         save_figure(figure, self.folder / "pictures" / f"{step:02d}_{pair.name}.png")
-        self.writer.add_figure("pair", figure, step, close=False)
+        self.figure("pair", figure, step)
+
+    def figure(self, tag: str, figure: Figure, step: int = 0) -> None:
+        """A figure as an event, without a PNG; it stays open."""
+        self.writer.add_figure(tag, figure, step, close=False)
+
+    def table(self, table: Table, step: int = 0) -> None:
+        """A table as text, under its title."""
+        self.writer.add_text(f"tables/{table.title}", table.to_markdown(), step)
