@@ -57,12 +57,11 @@ def check_annotation(pair: ScanPair, config: SimulatorConfig) -> None:
 
     motion = a.motions[a.body[has_partner]]
     moved = se2.rotate(motion[:, 0], source.points[has_partner]) + motion[:, 1:]
-    partner = a.association[has_partner]
+    gap = np.hypot(*(moved - target.points[a.association[has_partner]]).T)
     _, step = simulate.beam_bearings(config)
-    widest = target.ranges[partner] * step / simulate.LEAST_COSINE
-    gap = np.hypot(*(moved - target.points[partner]).T)
-    usual = float(np.median(target.ranges) * step / simulate.LEAST_COSINE) if len(target) else 0.0
-    assert (gap <= simulate.association_gate(widest, usual, config) + 1e-12).all()
+    if len(target):
+        widest = target.ranges * step / simulate.LEAST_COSINE
+        assert (gap <= simulate.association_gate(widest, config) + 1e-12).all()
 
 
 def test_same_seed_same_bytes():

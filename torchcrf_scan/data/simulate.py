@@ -26,8 +26,7 @@ VIBRATION_KNOTS = np.radians(8.0)  # neighbouring beams share a jolt over about 
 MIXED_JUMP = (0.3, 6.0)  # metres at full size: ranges this far apart merge in one beam; farther ones give two separate echoes
 GRAZING_COSINE = 0.03  # beams that graze a surface are lost: exp(-cosine / this)
 LEAST_COSINE = 0.1  # the spacing of returns on a surface is not trusted to grow beyond ten times that of a frontal one
-GATE_SPACING = 1.2  # the nearest of returns `spacing` apart is half a spacing away at most, a whole one where a beam is lost
-GATE_USUAL = 2.2  # times half the scan's usual spacing and twice its noise: annotators of recordings use one gate for a whole scan
+GATE = 3.2  # times half the scan's usual spacing and twice its noise: annotators of recordings use one gate for a whole scan
 LEAST_MOTION = 0.02  # metres at full size: what moves less within a pair stands still
 SENSOR_CLEARANCE = 0.3  # metres that movers keep from the sensor
 LEAST_SEEN = 3  # returns of a mover when it enters
@@ -184,21 +183,20 @@ def _measure(hits: Hits, config: SimulatorConfig, rng: np.random.Generator) -> t
 # --- annotation ---------------------------------------------------------------------------------------------------------------
 
 
-def association_gate(spacing: Floats, usual: float, config: SimulatorConfig) -> Floats:
-    """How far a moved return may be from its counterpart, metres; spacing: (...,) of the counterpart, usual: of its scan."""
+def association_gate(spacing: Floats, config: SimulatorConfig) -> float:
+    """How far a moved return may be from its counterpart, metres; spacing: (M,) of the target scan, not empty."""
     noise = float(np.hypot(config.range_noise, config.vibration))
-    return np.maximum(GATE_SPACING * spacing, GATE_USUAL * (usual / 2 + 2 * noise))
+    return GATE * (float(np.median(spacing)) / 2 + 2 * noise)
 
 
 def _associate(moved: Floats, body: Ints, target: Capture, target_body: Ints, config: SimulatorConfig) -> Ints:
-    """(N,) the nearest target return of the same body within its gate, or -1. moved: (N, 2). O(N M)."""
+    """(N,) the nearest target return of the same body within the gate, or -1. moved: (N, 2). O(N M)."""
     association = np.full(len(moved), OUTLIER)
     if not len(moved) or not len(target_body):
         return association
     offset = moved[:, None, :] - target.scan.points  # (N, M, 2)
     distance = np.hypot(offset[..., 0], offset[..., 1])
-    gate = association_gate(target.spacing, float(np.median(target.spacing)), config)
-    is_candidate = (body[:, None] == target_body) & (distance <= gate)
+    is_candidate = (body[:, None] == target_body) & (distance <= association_gate(target.spacing, config))
     distance[~is_candidate] = np.inf
     nearest = distance.argmin(1)
     found = np.isfinite(distance[np.arange(len(moved)), nearest])
