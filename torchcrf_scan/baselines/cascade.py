@@ -1,0 +1,31 @@
+"""Separate reasoning: CRF-Matching first, then CRF-Clustering on what it says, nothing fed back (spec 9.2, 9.4)."""
+
+from __future__ import annotations
+
+import torch
+
+from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
+from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.paper_start import movers_from_associations
+from torchcrf_scan.model import ClusteringCRF, MatchingCRF
+
+
+class Cascade:
+    """CRF-Clustering on the associations of CRF-Matching, nothing fed back (spec 9.4)."""
+
+    def __init__(self, matching: MatchingCRF, clustering: ClusteringCRF) -> None:
+        self.matching, self.clustering = matching, clustering
+
+    @torch.no_grad()
+    def feed(self, batch: ScanPairBatch, start: Start) -> Start:
+        """CRF-Matching's associations, its motion as background, movers from the runs of its residuals."""
+        matched = self.matching(batch, start.background_alone())
+        clusters = self.clustering.config.inference.clusters - 1
+        view, fitted = self.clustering.view(batch), self.matching.fitted
+        background = scale_motions(matched.motions[:, 0], view.factor)
+        fed = movers_from_associations(view, background, matched.association, fitted, clusters, start.target_tangents)
+        return fed.scaled(1 / view.factor)
+
+    def __call__(self, batch: ScanPairBatch, start: Start) -> Prediction:
+        """Decodes a batch."""
+        return self.clustering(batch, self.feed(batch, start))
