@@ -7,6 +7,7 @@ Chains are enumerated labelling by labelling, features are double loops over i a
 import itertools
 import math
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -223,3 +224,90 @@ def stump_sum(
     for f, limit, low, high in zip(feature, threshold, left, right, strict=True):
         total += low if phi[f] <= limit else high
     return total
+
+
+# The lattice: states (j, k) of one chain, numbered j * D + k; j = M and k = C are the outliers.
+
+
+def lattice_tables(unary: np.ndarray, association: np.ndarray, cluster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, A D) and (N-1, A D, A D) from factors (N, A, D), (N-1, A, A, 3) for one cluster, two, the outlier's, and (N-1, D, D)."""
+    N, A, D = unary.shape
+    nodes, edges = np.empty((N, A * D)), np.empty((N - 1, A * D, A * D))
+    for i, j, k in np.ndindex(N, A, D):
+        nodes[i, j * D + k] = unary[i, j, k]
+    for i, j, k, j2, k2 in np.ndindex(N - 1, A, D, A, D):
+        kind = 2 if D - 1 in (k, k2) else int(k != k2)
+        edges[i, j * D + k, j2 * D + k2] = association[i, j, j2, kind] + cluster[i, k, k2]
+    return nodes, edges
+
+
+def lattice_local(
+    source: np.ndarray,
+    target: np.ndarray,
+    motions: np.ndarray,
+    possible: np.ndarray,
+    scales: dict[str, Any],
+    initial_motion: Sequence[float],
+    data: Sequence[Sequence[float]],
+    outlier: Sequence[Sequence[float]],
+) -> np.ndarray:
+    """(N, A D, 30) features of every super-node, the pairwise ones 0. possible: (N, C); scales: the buffers of `Scales`."""
+    N, M, C = len(source), len(target), len(motions)
+    under = [np.array([move(g, p) for p in source]) for g in motions]
+    channels = [local_association(source, target, scales["local"], initial_motion, moved) for moved in under]
+    out = np.zeros((N, (M + 1) * (C + 1), 30))
+    for i in range(N):
+        mine = [k for k in range(C) if possible[i, k]]
+        best = channels[0][i].copy()
+        best[:, 11] = [max(channels[k][i, j, 11] for k in mine) for j in range(M)]
+        margins = [stump_sum(row, *data) for row in best]
+        top = max(range(M), key=lambda j: margins[j])
+        others = [margins[j] for j in range(M) if abs(j - top) >= 3]
+        gap = margins[top] - max(others) if others else 0.0
+        outlier_margin = stump_sum([*best.max(axis=0), margins[top], gap], *outlier)
+        nearest = min(math.dist(under[k][i], q) for k in mine for q in target)
+        for j, k in np.ndindex(M + 1, C + 1):
+            row = out[i, j * (C + 1) + k]
+            if j == M:
+                row[:12], row[13] = scales["local_outlier"], outlier_margin
+            else:
+                row[:12] = best[j] if k == C else channels[k][i, j]
+                row[12] = stump_sum(row[:12], *data)
+            if k < C and j < M:
+                row[18] = robust(math.dist(under[k][i], target[j]), scales["cluster_distance"])
+            row[19] = k == C and nearest > scales["outlier_threshold"]
+            row[20] = k < C and j < M
+            row[21] = k == C and j == M
+    return out
+
+
+def lattice_pairwise(source: np.ndarray, target: np.ndarray, motions: np.ndarray, scales: dict[str, Any]) -> np.ndarray:
+    """(N-1, A D, A D, 30) features of every transition, the local ones 0: both chains' with the associations at j and j'."""
+    N, M, C = len(source), len(target), len(motions)
+    D = C + 1
+    of_association = pairwise_association(source, target, scales["pairwise"], scales["pairwise_outlier"])
+    out = np.zeros((N - 1, (M + 1) * D, (M + 1) * D, 30))
+    for i, j, j2 in np.ndindex(N - 1, M + 1, M + 1):
+        labels = [j if j < M else -1, j2 if j2 < M else -1]
+        ends = source[i : i + 2]
+        of_cluster = pairwise_clustering(ends, target, motions, labels, scales["neighbour_weight"], scales["neighbour_distance"])
+        for k, k2 in np.ndindex(D, D):
+            out[i, j * D + k, j2 * D + k2, 14:18] = of_association[i, j, j2]
+            out[i, j * D + k, j2 * D + k2, 22:] = of_cluster[0, k, k2]
+    return out
+
+
+def conditionals(unary: np.ndarray, pairwise: np.ndarray, labels: Sequence[int], weights: np.ndarray) -> list[float]:
+    """log p(label of i | labels of i - 1 and i + 1), a node after the other. unary: (N, S, F), pairwise: (N-1, S, S, F)."""
+    out = []
+    for i, label in enumerate(labels):
+        scores = []
+        for state in range(unary.shape[1]):
+            total = float(unary[i, state] @ weights)
+            if i > 0:
+                total += float(pairwise[i - 1, labels[i - 1], state] @ weights)
+            if i + 1 < len(labels):
+                total += float(pairwise[i, state, labels[i + 1]] @ weights)
+            scores.append(total)
+        out.append(scores[label] - log_sum_exp(scores))
+    return out

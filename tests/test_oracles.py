@@ -140,3 +140,48 @@ def test_stump_sum() -> None:
     stumps = ([0, 1, 0], [0.5, 2.0, 0.0], [-1.0, 0.25, 3.0], [1.0, -0.25, 5.0])
     assert oracles.stump_sum([0.5, 2.5], *stumps) == -1.0 - 0.25 + 5.0
     assert oracles.stump_sum([0.75, 2.0], *stumps) == 1.0 + 0.25 + 5.0
+
+
+def test_lattice_tables() -> None:
+    unary = np.array([[[1.0, 2.0], [3.0, 4.0]], [[5.0, 6.0], [7.0, 8.0]]])
+    association = np.arange(12.0).reshape(1, 2, 2, 3)
+    cluster = np.array([[[0.0, 100.0], [200.0, 300.0]]])
+    nodes, edges = oracles.lattice_tables(unary, association, cluster)
+    assert nodes.tolist() == [[1, 2, 3, 4], [5, 6, 7, 8]]
+    assert edges[0, 0, 2] == 3  # (0, 0) -> (1, 0): one cluster
+    assert edges[0, 0, 3] == 5 + 100  # (0, 0) -> (1, outlier)
+    assert edges[0, 3, 1] == 8 + 300  # (1, outlier) -> (0, outlier) touches it too
+    wider = oracles.lattice_tables(np.zeros((2, 2, 3)), association, np.zeros((1, 3, 3)))[1]
+    assert wider[0, 0, 1] == 1  # (0, 0) -> (0, 1): two clusters
+
+
+SCALES = {
+    **{"local": [1.0] * 12, "local_outlier": [-4.0] * 12, "pairwise": [1.0, 1.0], "pairwise_outlier": [-0.5, -0.25]},
+    **{"cluster_distance": 0.5, "outlier_threshold": 0.6, "neighbour_weight": 2.0, "neighbour_distance": 1.0},
+}
+
+
+def test_lattice_local() -> None:
+    data, outlier = ([11], [-0.5], [-1.0], [1.0]), ([11], [-0.5], [2.0], [3.0])
+    possible = np.array([[True, True], [True, False], [True, True]])
+    out = oracles.lattice_local(POINTS, PARTNERS, MOTIONS, possible, SCALES, (0.0, 0.0, 0.0), data, outlier)
+    assert out.shape == (3, 9, 30)
+    inlier, out_of_cluster, out_of_both = out[0, 0 * 3 + 1], out[0, 0 * 3 + 2], out[0, 8]
+    assert inlier[[11, 12, 18, 20]].tolist() == [0, 1, 0, 1]  # (0, 0) moved up meets its candidate
+    assert out[0, 0, [11, 12, 18]].tolist() == [-1, -1, -4]  # and not where it stays
+    assert out_of_cluster[[11, 12, 18, 19, 20, 21]].tolist() == [0, 1, 0, 0, 0, 0]  # the better of both, but no cluster
+    assert out_of_both[[11, 12, 13, 18, 19, 21]].tolist() == [-4, 0, 3, 0, 0, 1]
+    assert out[1, 2, 11] == pytest.approx(-2)  # without the second motion (1, 0) is sqrt 2 from (0, 1)
+    assert not out[..., 14:18].any()
+    assert not out[..., 22:].any()
+
+
+def test_lattice_pairwise() -> None:
+    out = oracles.lattice_pairwise(POINTS[[0, 2]], PARTNERS, MOTIONS, SCALES)
+    assert out.shape == (1, 9, 9, 30)
+    inliers = oracles.pairwise_clustering(POINTS[[0, 2]], PARTNERS, MOTIONS, [0, 1], 2.0, 1.0)[0, 0, 1]
+    assert out[0, 0, 3 + 1, 22:].tolist() == pytest.approx(inliers.tolist())
+    assert out[0, 0, 3 + 1, 14] == 1  # candidate 0, then 1
+    assert out[0, 0, 8, 14:18].tolist() == [0, 1, -0.5, -0.25]
+    assert out[0, 0, 8, 22:].tolist() == [0] * 7 + [1]
+    assert not out[0, 0, 6 + 1, 25:28].any()  # no association, no stretch

@@ -1,0 +1,167 @@
+"""Features of the lattice: association and clustering joined into super-nodes (j, k), spec 7.7.
+
+A super-node's states are pairs of an association state j (K candidates, the outlier last: A = K + 1) and a cluster k (C clusters,
+the outlier last: D = C + 1). The 30 named weights stay, but nothing is plugged in any more: every feature sees its own j and k.
+Transitions (j, k) -> (j', k') are never spelled out as an A D x A D table. They are A(j, j') + C(k, k') and, for stiffness and
+elongation, a third term that needs both, but of k and k' only whether they are the same inlier cluster, two, or the outlier.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchcrf_scan.features import association, clustering
+from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, state_mask, unary_at
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, STATIC_CHANNELS, Scales, robust_square
+from torchcrf_scan.features.shape import gather_points
+
+# Where the features' weights are among the 30, association before clustering.
+FIRST_CLUSTERING = len(ASSOCIATION_WEIGHTS)
+STATIC_WEIGHTS = (*range(STATIC_CHANNELS), 13)
+MOVING_WEIGHTS = (11, 12, *range(FIRST_CLUSTERING, FIRST_CLUSTERING + 4))
+ASSOCIATION_PAIRWISE = slice(14, FIRST_CLUSTERING)
+CLUSTER_PAIRWISE = slice(FIRST_CLUSTERING + 4, None)
+ELASTIC_WEIGHTS = slice(FIRST_CLUSTERING + 7, FIRST_CLUSTERING + 10)  # Q4..Q6, also among CLUSTER_PAIRWISE
+
+SAME, DIFFERENT, TOUCHING = range(3)  # kinds of cluster transitions: one inlier cluster, two, the outlier at an end
+ELASTIC_KINDS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))  # Q4..Q6 by kind
+
+
+def transition_kinds(clusters: int, device: torch.device | None = None) -> Tensor:
+    """(D, D) kind of every cluster transition; D = `clusters`, the outlier last."""
+    kinds = torch.full((clusters, clusters), DIFFERENT, device=device)
+    kinds.fill_diagonal_(SAME)
+    kinds[-1], kinds[:, -1] = TOUCHING, TOUCHING
+    return kinds
+
+
+@dataclass(frozen=True, slots=True)
+class LatticePotentials:
+    """Log potentials of a chain of super-nodes, factored.
+
+    Attributes:
+        log_unary: (B, N, A, D).
+        log_association: (B, N-1, A, A, 3) association transitions, by the kind of cluster transition that goes with them.
+        log_cluster: (B, N-1, D, D) cluster transitions.
+    """
+
+    log_unary: Tensor
+    log_association: Tensor
+    log_cluster: Tensor
+
+    def cut(self, known: Tensor) -> LatticePotentials:
+        """Without the nodes that are not known (B, N), padding for one, and without their edges."""
+        edge = (known[:, 1:] & known[:, :-1])[..., None, None]
+        none = torch.zeros((), dtype=self.log_unary.dtype, device=known.device)
+        return LatticePotentials(
+            torch.where(known[..., None, None], self.log_unary, none),
+            torch.where(edge[..., None], self.log_association, none),
+            torch.where(edge, self.log_cluster, none),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LatticeFeatures:
+    """Features of super-nodes and their transitions.
+
+    Attributes:
+        static: (B, N, A, 12) what depends on j alone: L1..L11 and the outlier booster's margin.
+        moving: (B, N, A, D, 6) registered translation, the data booster's margin, C1..C4.
+        pairwise_association: (B, N-1, A, A, 4) P1..P4.
+        elastic: (B, N-1, A, A, 3) Q4..Q6 of two candidates, for the kinds of cluster transitions that they belong to.
+        pairwise_cluster: (B, N-1, D, D, 8) Q1..Q8, without Q4..Q6.
+        mask: (B, N, A, D) possible states.
+    """
+
+    static: Tensor
+    moving: Tensor
+    pairwise_association: Tensor
+    elastic: Tensor
+    pairwise_cluster: Tensor
+    mask: Tensor
+
+    def potentials(self, weights: Tensor) -> LatticePotentials:
+        """Log potentials. weights: (30,), association before clustering."""
+        log_unary = (self.static @ weights[list(STATIC_WEIGHTS)])[..., None] + self.moving @ weights[list(MOVING_WEIGHTS)]
+        by_kind = weights[ELASTIC_WEIGHTS, None] * weights.new_tensor(ELASTIC_KINDS)  # (3 features, 3 kinds)
+        log_association = (self.pairwise_association @ weights[ASSOCIATION_PAIRWISE])[..., None] + self.elastic @ by_kind
+        log_cluster = self.pairwise_cluster @ weights[CLUSTER_PAIRWISE]
+        return LatticePotentials(log_unary.masked_fill(~self.mask, -torch.inf), log_association, log_cluster)
+
+
+def lattice_features(
+    view: PairView,
+    states: AssociationStates,
+    motions: Tensor,
+    nearest: Tensor,
+    possible: Tensor,
+    scales: Scales,
+    boosters: Boosters,
+) -> LatticeFeatures:
+    """Features of every super-node, its point moved by its own cluster's motion.
+
+    A point in the outlier cluster has no motion: its registered channel is the best over the possible clusters, candidate by
+    candidate (A-12), and so are the inputs of the outlier booster, whose margin therefore does not depend on k. C2 takes the
+    nearest target point under the possible motions. Needs B N K^2 and B N K D; dense candidates are for small scans.
+
+    Args:
+        states: candidates (B, N, K) with their static features. motions: (B, C, 3).
+        nearest: (B, N, C) nearest target point under every motion. possible: (B, N, D) clusters that are not ruled out.
+    """
+    batch = view.batch
+    nobody = torch.full_like(nearest[..., 0], -1)
+    at = clustering.correspond(batch.source, batch.target, motions, nearest, nobody)
+    partner = gather_points(batch.target, states.candidates)  # (B, N, K, 2)
+    distance = torch.linalg.vector_norm(at.moved[:, :, None] - partner[..., None, :], dim=-1)  # (B, N, K, C)
+    registered = robust_square(distance, scales.local[STATIC_CHANNELS])
+    best = registered.masked_fill(~possible[:, :, None, :-1], -torch.inf).amax(-1)  # (B, N, K)
+    static = unary_at(states, best, scales, boosters)[..., list(STATIC_WEIGHTS)]
+    registered = torch.cat([registered, best[..., None]], dim=-1)  # (B, N, K, D)
+    residual = at.residual.masked_fill(~possible[..., :-1], torch.inf).amin(-1)
+    return LatticeFeatures(
+        static=static,
+        moving=torch.cat(
+            [
+                registered_channels(registered, states.static_margin, scales, boosters),
+                cluster_channels(robust_square(distance, scales.cluster_distance), residual > scales.outlier_threshold),
+            ],
+            dim=-1,
+        ),
+        pairwise_association=association.pairwise_features(batch.source, batch.target, states.candidates, scales),
+        elastic=elastic_features(batch.source, partner, scales),
+        pairwise_cluster=clustering.pairwise_features(batch.source, at, scales),
+        mask=state_mask(states.mask)[..., None] & possible[:, :, None],
+    )
+
+
+def registered_channels(registered: Tensor, static_margin: Tensor, scales: Scales, boosters: Boosters) -> Tensor:
+    """L12 and the data booster's margin, (B, N, A, D, 2). registered: (B, N, K, D); static_margin: (B, N, K)."""
+    margin = static_margin[..., None] + boosters.data.margins(registered[..., None], first=STATIC_CHANNELS)
+    outlier = torch.stack([scales.local_outlier[STATIC_CHANNELS], torch.zeros_like(scales.local_outlier[0])])
+    B, N, _, D = registered.shape
+    return torch.cat([torch.stack([registered, margin], dim=-1), outlier.to(registered).expand(B, N, 1, D, 2)], dim=2)
+
+
+def cluster_channels(distance: Tensor, unexplained: Tensor) -> Tensor:
+    """C1..C4, (B, N, A, D, 4). distance: (B, N, K, C) of inlier states; unexplained: (B, N) no motion meets a target point.
+
+    In the training truth a point is an outlier of both labels or of none, so C3 and C4 alone separate it (A-28): only the prior
+    bounds their weights.
+    """
+    B, N, K, C = distance.shape
+    both_inliers = pad(torch.ones_like(distance), (0, 1, 0, 1))
+    outlier_cluster = pad(unexplained.to(distance)[:, :, None, None].expand(B, N, K + 1, 1), (C, 0))
+    both_outliers = pad(distance.new_ones(B, N, 1, 1), (C, 0, K, 0))
+    return torch.stack([pad(distance, (0, 1, 0, 1)), outlier_cluster, both_inliers, both_outliers], dim=-1)
+
+
+def elastic_features(source_points: Tensor, partner: Tensor, scales: Scales) -> Tensor:
+    """Q4..Q6 from the candidates' own distance, (B, N-1, A, A, 3); 0 at the outlier. partner: (B, N, K, 2) candidates."""
+    d1 = torch.linalg.vector_norm(source_points[:, 1:] - source_points[:, :-1], dim=-1)
+    d2 = torch.linalg.vector_norm(partner[:, 1:, None] - partner[:, :-1, :, None], dim=-1)  # (B, N-1, K, K)
+    stiff, elongation = clustering.elasticity(d2 - d1[..., None, None], scales)
+    return pad(torch.stack([stiff, 1 - stiff, elongation], dim=-1), (0, 0, 0, 1, 0, 1))
