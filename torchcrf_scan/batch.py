@@ -75,6 +75,18 @@ class ScanPairBatch:
         truth = self.truth and Truth(*(getattr(self.truth, f.name)[index] for f in fields(self.truth)))
         return ScanPairBatch(**part, truth=truth)
 
+    def select(self, index: Tensor) -> ScanPairBatch:
+        """The pairs index (P,) int64, their padding cut to the longest scan among them."""
+        longest = {side: max(1, int(getattr(self, f"{side}_mask")[index].sum(-1).max())) for side in ("source", "target")}
+        length = {name: longest[name.removesuffix("_mask")] for name in ("source", "target", "source_mask", "target_mask")}
+        part = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "truth"}
+        part |= {name: part[name][:, :most] for name, most in length.items()}
+        n = longest["source"]
+        truth = self.truth and Truth(
+            self.truth.association[index, :n], self.truth.cluster[index, :n], self.truth.motions[index], self.truth.known[index, :n]
+        )
+        return ScanPairBatch(**part, truth=truth)
+
     def scaled(self, factor: Tensor) -> ScanPairBatch:
         """The same scenes in another unit of length, a factor (B,) a pair."""
         by_pair = factor[:, None, None]

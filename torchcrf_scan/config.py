@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
+
+WEIGHTS = (*(f"association.{name}" for name in ASSOCIATION_WEIGHTS), *(f"clustering.{name}" for name in CLUSTERING_WEIGHTS))
+
 
 @dataclass(frozen=True)
 class SimulatorConfig:
@@ -93,14 +97,17 @@ class InferenceConfig:
 
     Attributes:
         clusters: D, states of the clustering chain: background, movers, outlier.
-        candidates: K inlier states of a point, nearest under the motions; 0 = every target point (dense).
+        candidates: K inlier states of a point; 0 = every target point (dense).
+        candidate_search: the K nearest under the present motions (`motion`), in raw position (`position`), or the K most alike in
+            shape (`shape`).
         schedule: `sweep` (exact passes over each chain, motions between) or `flooding` (Algorithm 1 node by node).
         flooding_order: `alternate` or `ascending` (A-20), for flooding only.
         iterations: rounds at most.
         stop_early: stop when everything has settled; off, exactly `iterations` rounds are unrolled.
         temperature: 0 = max-product, 1 = sum-product.
         motion_weights: `hard` (labels, the paper's) or `soft` (beliefs; lets gradients reach the weights).
-        motion_metric: `point` (Kabsch, the paper's) or `line` (robust point-to-line step).
+        motion_metric: `point` (Kabsch, the paper's) or `line` (robust point-to-line step); or `given`: the motions stay those of
+            the start (in the `sweep`).
         min_extent: metres (in the unit `spacing`, those of a street scanner); a smaller cluster takes the background's rotation.
         rotation_tolerance: radians below which a motion has settled.
         translation_tolerance: metres below which a motion has settled.
@@ -108,6 +115,7 @@ class InferenceConfig:
 
     clusters: int = 8
     candidates: int = 8
+    candidate_search: str = "motion"
     schedule: str = "sweep"
     flooding_order: str = "alternate"
     iterations: int = 10
@@ -120,10 +128,11 @@ class InferenceConfig:
     translation_tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
+        _choose("candidate_search", self.candidate_search, ("motion", "position", "shape"))
         _choose("schedule", self.schedule, ("sweep", "flooding"))
         _choose("flooding_order", self.flooding_order, ("alternate", "ascending"))
         _choose("motion_weights", self.motion_weights, ("hard", "soft"))
-        _choose("motion_metric", self.motion_metric, ("point", "line"))
+        _choose("motion_metric", self.motion_metric, ("point", "line", "given"))
         if self.clusters < 2:
             raise ValueError(f"clusters: expected at least 2 (background and outlier), got {self.clusters}")
         for name in ("candidates", "iterations", "temperature"):
@@ -142,14 +151,19 @@ class FeatureConfig:
         length_unit: what lengths are measured in: `spacing` (what each pair's own scans resolve, so one set of weights serves a
             street and a table top) or `metre`, the paper's.
         stumps: decision stumps in each booster.
+        left_out: features that the model does without, as `association.NAME` or `clustering.NAME` of a weight; a local channel is
+            then hidden from the boosters too.
     """
 
     raw_channels: bool = True
     wrap_closed: bool = True
     length_unit: str = "spacing"
     stumps: int = 50
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in self.left_out:
+            _choose("left_out", name, WEIGHTS)
         _choose("length_unit", self.length_unit, ("spacing", "metre"))
 
 
@@ -159,17 +173,25 @@ class ModelConfig:
 
     Attributes:
         chains: `joint`, or one chain alone: `matching`, `clustering`.
-        start: `search` (hypotheses over the whole scene) or `paper` (spec 7.3: association chain, then runs of residuals).
+        coupling: of the joint chains: `motions` (the paper's) or `lattice`: both labels of a point are decided at once (spec 7.7).
+        start: `search` (hypotheses over the whole scene), `paper` (spec 7.3: association chain, then runs of residuals) or `points`
+            (the same chain, then one cluster a point, of which the vacuous ones are discarded).
     """
 
     chains: str = "joint"
+    coupling: str = "motions"
     start: str = "search"
     features: FeatureConfig = field(default_factory=FeatureConfig)
     inference: InferenceConfig = field(default_factory=InferenceConfig)
 
     def __post_init__(self) -> None:
         _choose("chains", self.chains, ("joint", "matching", "clustering"))
-        _choose("start", self.start, ("search", "paper"))
+        _choose("coupling", self.coupling, ("motions", "lattice"))
+        _choose("start", self.start, ("search", "paper", "points"))
+        if self.coupling == "lattice" and self.chains != "joint":
+            raise ValueError(f"coupling: expected motions for the {self.chains} chain alone, got lattice")
+        if self.coupling == "lattice" and self.inference.schedule != "sweep":
+            raise ValueError(f"coupling: expected motions with schedule {self.inference.schedule}, got lattice")
 
 
 @dataclass(frozen=True)
@@ -188,6 +210,7 @@ class LearningConfig:
             `likelihood`. CRF-Clustering alone always sees predicted ones.
         folds: parts of the training pairs for out-of-fold margins; sequences stay whole. 0: margins on the same pairs (faithful).
         negatives: wrong pairs per true one for the data booster.
+        booster_examples: examples that a booster sees at most, drawn at random; 0: all.
         prior: standard deviation s_w of the weights' Gaussian prior, on standardised features.
         max_steps: L-BFGS steps at most.
         tolerance: gradient per node at which L-BFGS stops.
@@ -203,6 +226,7 @@ class LearningConfig:
     predicted_share: float = 0.0
     folds: int = 4
     negatives: int = 4
+    booster_examples: int = 5_000
     prior: float = 10.0
     max_steps: int = 200
     tolerance: float = 1e-4
@@ -243,10 +267,51 @@ class DataConfig:
 
 
 @dataclass(frozen=True)
-class Config:
-    """One run of `train.py`.
+class ExperimentConfig:
+    """The paper's experiment, `torchcrf-scan experiment`: every pair is tested by models that have not seen it.
 
     Attributes:
+        pairs: a file, folder or glob pattern of the annotated pairs, or a list of them; none: the simulated `worlds`.
+        worlds: names of simulated `WORLDS`, `data.pairs` pairs each, where no files are given.
+        also_train: names of simulated `WORLDS` that every fold trains on besides, `data.pairs` pairs each.
+        protocols: `leave_one_pair_out` (the paper's; consecutive pairs share a scan, so it leaks) and `leave_one_sequence_out`.
+        joint_alone: of all the methods, only the joint model (for ablations).
+        test_every: test every so many pairs only, for models that are slow to decode.
+        leave_out: features, named as in `FeatureConfig.left_out`: a variant without each of them (for ablations).
+        exact: in leave_one_sequence_out, joint models fitted by exact likelihood too (half of a fold's time).
+        figures: pairs to draw, as SEQUENCE:NUMBER, the number counting from 0; none: one of every sequence.
+        resamples: of the bootstrap.
+        jobs: processes; 0: one a core.
+    """
+
+    pairs: tuple[str, ...] | str = ()
+    worlds: tuple[str, ...] = ("street",)
+    also_train: tuple[str, ...] = ()
+    protocols: tuple[str, ...] = ("leave_one_pair_out", "leave_one_sequence_out")
+    joint_alone: bool = False
+    test_every: int = 1
+    leave_out: tuple[str, ...] = ()
+    exact: bool = True
+    figures: tuple[str, ...] = ()
+    resamples: int = 2000
+    jobs: int = 0
+
+    def __post_init__(self) -> None:
+        for world in (*self.worlds, *self.also_train):
+            _choose("worlds", world, tuple(WORLDS))
+        for protocol in self.protocols:
+            _choose("protocols", protocol, ("leave_one_pair_out", "leave_one_sequence_out"))
+        for name, least in (("test_every", 1), ("resamples", 1), ("jobs", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class Config:
+    """One run of `train.py` or of `torchcrf-scan experiment`.
+
+    Attributes:
+        experiment: what `torchcrf-scan experiment` does; `train.py` does not look at it.
         output: run folder; resolved config, versions, model, metrics, events and pictures go there.
         overfit: train and test on the first training pair alone, a quick check that everything can learn.
         compare_chains: also fit and evaluate CRF-Matching and CRF-Clustering alone.
@@ -255,6 +320,7 @@ class Config:
     data: DataConfig = field(default_factory=DataConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     learning: LearningConfig = field(default_factory=LearningConfig)
+    experiment: ExperimentConfig = field(default_factory=ExperimentConfig)
     output: str = "runs/default"
     overfit: bool = False
     compare_chains: bool = True

@@ -16,12 +16,13 @@ from torch import Tensor, nn
 from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.features.potentials import Boosters, PairView
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS, Scales
-from torchcrf_scan.inference import flooding, joint, pseudo_likelihood
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales, live_weights
+from torchcrf_scan.inference import flooding, joint, lattice_likelihood, pseudo_likelihood
 from torchcrf_scan.inference.initialise import Start, initialise
 from torchcrf_scan.inference.joint import Parameters
 from torchcrf_scan.inference.movers import HypothesisScore
 from torchcrf_scan.inference.paper_start import paper_start
+from torchcrf_scan.inference.points_start import points_start
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 
 PRETRAINED = "simulated"
@@ -71,12 +72,11 @@ class JointScanCRF(nn.Module):
 
     @property
     def weight_vectors(self) -> tuple[Tensor, Tensor]:
-        """(18,) and (12,): the weights in the order of `ASSOCIATION_WEIGHTS` and `CLUSTERING_WEIGHTS`, raw channels off in W-B."""
+        """(18,) and (12,): the weights in the order of `ASSOCIATION_WEIGHTS` and `CLUSTERING_WEIGHTS`, 0 for what is left out."""
         association = torch.stack([self.association_weights[name] for name in ASSOCIATION_WEIGHTS])
-        if not self.config.features.raw_channels:
-            live = torch.arange(len(association), device=association.device) >= len(LOCAL_CHANNELS)
-            association = association * live
-        return association, torch.stack([self.clustering_weights[name] for name in CLUSTERING_WEIGHTS])
+        clustering = torch.stack([self.clustering_weights[name] for name in CLUSTERING_WEIGHTS])
+        live = live_weights(self.config.features)
+        return association * live[0].to(association), clustering * live[1].to(clustering)
 
     @property
     def fitted(self) -> Parameters:
@@ -92,11 +92,12 @@ class JointScanCRF(nn.Module):
         clusters = self.config.inference.clusters - 1
         if self.config.chains == "matching":
             clusters = 1
-        found = initialise(batch, self.scales, self.hypothesis_score, clusters)
+        found = initialise(batch, self.hypothesis_score, clusters)
         if self.config.start == "search":
             return found
         view = self.view(batch)
-        return paper_start(view, found.scaled(view.factor), self.fitted, self.config.inference).scaled(1 / view.factor)
+        look = {"paper": paper_start, "points": points_start}[self.config.start]
+        return look(view, found.scaled(view.factor), self.fitted, self.config.inference).scaled(1 / view.factor)
 
     def forward(self, batch: ScanPairBatch, start: Start | None = None) -> Prediction:
         """Labels, motions and log-beliefs of every pair.
@@ -122,6 +123,8 @@ class JointScanCRF(nn.Module):
         plugins = plugins or pseudo_likelihood.true_plugins(view.batch, self.config.inference.clusters - 1)
         if self.config.chains == "matching":
             plugins = pseudo_likelihood.for_background_alone(plugins)
+        if self.config.coupling == "lattice":
+            return lattice_likelihood.pseudo_log_likelihood(view, plugins, self.fitted, self.config.inference)
         return pseudo_likelihood.pseudo_log_likelihood(view, plugins, self.fitted, self.config)
 
     @torch.no_grad()
@@ -180,21 +183,21 @@ class MatchingCRF(JointScanCRF):
     """The association chain alone, 18 weights, one motion for the whole scan (A-25): CRF-Matching."""
 
     def __init__(self, config: ModelConfig | None = None) -> None:
-        super().__init__(replace(config or ModelConfig(), chains="matching"))
+        super().__init__(replace(config or ModelConfig(), chains="matching", coupling="motions"))
 
 
 class ClusteringCRF(JointScanCRF):
     """The clustering chain alone, 12 weights, on associations that come with the start and stay: CRF-Clustering."""
 
     def __init__(self, config: ModelConfig | None = None) -> None:
-        super().__init__(replace(config or ModelConfig(), chains="clustering"))
+        super().__init__(replace(config or ModelConfig(), chains="clustering", coupling="motions"))
 
 
 def model_config(values: dict[str, Any]) -> ModelConfig:
     """The config that `asdict` made into a dictionary."""
     return ModelConfig(
         **{k: v for k, v in values.items() if k not in ("features", "inference")},
-        features=FeatureConfig(**values["features"]),
+        features=FeatureConfig(**{**values["features"], "left_out": tuple(values["features"].get("left_out", ()))}),
         inference=InferenceConfig(**values["inference"]),
     )
 

@@ -12,7 +12,6 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.features.potentials import PairView
-from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.cold import ransac_motions, shape_association
 from torchcrf_scan.inference.initialise import FOOTPRINT, Start, initialise, nearest_association
@@ -33,7 +32,7 @@ def pairs() -> list[ScanPair]:
 
 
 def start_of(batch: ScanPairBatch, clusters: int = 7) -> Start:
-    return initialise(batch, Scales().to(batch.source.dtype), HypothesisScore().to(batch.source.dtype), clusters)
+    return initialise(batch, HypothesisScore().to(batch.source.dtype), clusters)
 
 
 def recovered(found: Tensor, truth: np.ndarray, translation: float = TRANSLATION) -> int:
@@ -189,7 +188,7 @@ def test_shapes_alone_find_the_partners_wherever_the_scan_went() -> None:
     source = make_points(40, 3)[None]
     target = se2.apply(torch.tensor([[1.0, 20.0, -7.0]]).double(), source)[:, 5:]
     batch = plain_batch(source, target)
-    found = shape_association(PairView.of(batch), Scales().double())[0]
+    found = shape_association(PairView.of(batch))[0]
     assert (found[8:32] == torch.arange(8, 32) - 5).all()
 
 
@@ -197,7 +196,7 @@ def test_shapes_of_an_empty_scan_match_nothing() -> None:
     batch = plain_batch(make_points(5, 1)[None], make_points(4, 2)[None])
     for name in ("source_mask", "target_mask"):
         empty = replace(batch, **{name: torch.zeros_like(getattr(batch, name))})
-        assert (shape_association(PairView.of(empty), Scales().double()) == -1).all()
+        assert (shape_association(PairView.of(empty)) == -1).all()
 
 
 # --- the paper's start --------------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from scenes import CASES, MOTIONS, assert_same, assert_sane, make_batch, make_start, part_of, poor_scene, scene
 from support import assert_close, generator, make_points, normal
 from torch import Tensor
 
@@ -21,47 +22,7 @@ from torchcrf_scan.inference.joint import Parameters
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
 from torchcrf_scan.scan import Scan, ScanPair
 
-MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3], [0.2, -0.2, -1.0]], dtype=torch.float64)
 MODEL = JointScanCRF().double()
-CASES = ("all outliers", "empty source", "empty target", "one point", "duplicates", "background only")
-
-
-def make_batch(source: Tensor, target: Tensor, lengths: tuple[list[int], list[int]] | None = None) -> ScanPairBatch:
-    """source: (B, N, 2), target: (B, M, 2); lengths: how many of each scan's points are real."""
-    B, N, M = len(source), source.shape[1], target.shape[1]
-    n, m = (torch.tensor(count)[:, None] for count in lengths or ([N] * B, [M] * B))
-    source_mask, target_mask = torch.arange(N) < n, torch.arange(M) < m
-    return ScanPairBatch(
-        source=source * source_mask[..., None],
-        target=target * target_mask[..., None],
-        source_mask=source_mask,
-        target_mask=target_mask,
-        source_closed=torch.zeros(B, dtype=torch.bool),
-        target_closed=torch.zeros(B, dtype=torch.bool),
-        dt=torch.full((B,), 0.1).to(source),
-        range_noise=torch.full((B,), 0.01).to(source),
-        initial_motion=torch.zeros(B, 3).to(source),
-    )
-
-
-def make_start(batch: ScanPairBatch, motions: Tensor, association: Tensor | None = None, active: Tensor | None = None) -> Start:
-    """motions: (C, 3), the same for every pair; tangents point across the beam."""
-    B, C = len(batch), len(motions)
-    motions = motions.to(batch.source).expand(B, C, 3)
-    active = torch.ones(B, C, dtype=torch.bool) if active is None else active.expand(B, C)
-    if association is None:
-        association = nearest_association(batch, motions, active, gate=20.0)
-    across = torch.stack([-batch.target[..., 1], batch.target[..., 0]], dim=-1)
-    return Start(motions, active, association, torch.nn.functional.normalize(across, dim=-1))
-
-
-def scene(n: int = 24, movers: int = 2, seed: int = 1) -> tuple[ScanPairBatch, Tensor]:
-    """One pair whose points form runs that move as MOTIONS says, a little noisy, and the clusters of its points."""
-    source = make_points(n, seed)
-    cluster = torch.arange(n) * (2 * movers + 1) // n  # background and movers in turn
-    cluster = torch.where(cluster % 2 == 1, (cluster + 1) // 2, 0)
-    target = se2.apply(MOTIONS[cluster], source[:, None])[:, 0] + 0.005 * normal(n, 2, seed=seed)
-    return make_batch(source[None], target[None]), cluster
 
 
 def random_parameters(seed: int) -> Parameters:
@@ -77,41 +38,6 @@ def decode(
 ) -> Prediction:
     with torch.no_grad():
         return joint.decode(PairView.of(batch), start, parameters or MODEL.fitted, settings or config())
-
-
-def part_of(batch: ScanPairBatch, start: Start, b: int) -> tuple[ScanPairBatch, Start]:
-    """Pair b without its padding."""
-    n, m = int(batch.source_mask[b].sum()), int(batch.target_mask[b].sum())
-    alone = batch[b : b + 1]
-    cut = {"source": n, "source_mask": n, "target": m, "target_mask": m}
-    alone = replace(alone, **{name: getattr(alone, name)[:, :length] for name, length in cut.items()})
-    here = slice(b, b + 1)
-    return alone, Start(start.motions[here], start.active[here], start.association[here, :n], start.target_tangents[here, :m])
-
-
-def assert_same(found: Prediction, expected: Prediction, b: int, n: int) -> None:
-    """Pair b of `found` is the only pair of `expected`, n points long."""
-    assert found.association[b, :n].tolist() == expected.association[0].tolist()
-    assert found.cluster[b, :n].tolist() == expected.cluster[0].tolist()
-    assert_close(found.motions[b], expected.motions[0])
-    assert_close(found.log_cluster[b, :n], expected.log_cluster[0])
-    for name in ("active", "converged", "iterations"):
-        assert torch.equal(getattr(found, name)[b], getattr(expected, name)[0]), name
-
-
-def assert_sane(found: Prediction, batch: ScanPairBatch) -> None:
-    """Finite motions, no NaN, labels that exist, beliefs that sum to one."""
-    assert found.motions.isfinite().all()
-    assert not found.log_association.isnan().any()
-    assert not found.log_cluster.isnan().any()
-    assert found.active[:, 0].all()
-    for log in (found.log_association, found.log_cluster):
-        assert_close(log[batch.source_mask].exp().sum(-1), torch.ones(int(batch.source_mask.sum())).double())
-    assert (found.association[~batch.source_mask] == -1).all()
-    assert (found.cluster[~batch.source_mask] == -1).all()
-    assert (found.association < batch.target_mask.sum(-1, keepdim=True)).all()
-    chosen = found.active.gather(1, found.cluster.clamp(min=0))
-    assert (chosen | (found.cluster < 0)).all()
 
 
 # --- exactness ----------------------------------------------------------------------------------------------------------------
@@ -378,21 +304,6 @@ def test_more_movers_than_slots() -> None:
 # --- scans with little in them ------------------------------------------------------------------------------------------------
 
 
-def poor_scene(name: str) -> tuple[ScanPairBatch, Start]:
-    source, target = make_points(7, 1)[None], make_points(6, 2)[None]
-    lengths = {"empty source": ([0], [6]), "empty target": ([7], [0]), "one point": ([1], [1])}.get(name, ([7], [6]))
-    if name == "duplicates":
-        source, target = source[:, :1].expand(1, 7, 2), source[:, :1].expand(1, 6, 2)
-    batch = make_batch(source, target, lengths)
-    nobody = torch.full((1, 7), -1)
-    association = nobody if name == "all outliers" else None
-    motions = MOTIONS[:1] if name == "background only" else MOTIONS
-    if name == "all outliers":
-        motions = motions + torch.tensor([0.0, 500.0, 500.0])
-    start = make_start(batch, motions, association)
-    return batch, start
-
-
 @pytest.mark.parametrize("chains", ["joint", "matching", "clustering"])
 @pytest.mark.parametrize("settings", [{}, {"temperature": 1.0, "motion_weights": "soft", "candidates": 0}])
 @pytest.mark.parametrize("name", CASES)
@@ -470,3 +381,44 @@ def test_a_scan_pair_without_returns_is_matched() -> None:
         found = JointScanCRF().match_pairs([pair])[0]
         assert (found.association == -1).all()
         assert np.isfinite(found.motions).all()
+
+
+# --- motions that are given ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chains", ["joint", "matching", "clustering"])
+@pytest.mark.parametrize("weights", ["hard", "soft"])
+def test_given_motions_stay_exactly(chains: str, weights: str) -> None:
+    batch, _ = scene()
+    start = make_start(batch, MOTIONS[:1] if chains == "matching" else MOTIONS)
+    given = InferenceConfig(motion_metric="given", motion_weights=weights, stop_early=False)
+    found, moved = (
+        decode(batch, start, settings=ModelConfig(chains=chains, inference=inference))
+        for inference in (given, replace(given, motion_metric="point"))
+    )
+    assert torch.equal(found.motions, start.motions)
+    assert not torch.equal(moved.motions, start.motions)
+    assert_sane(found, batch)
+
+
+def test_the_labels_at_given_motions_are_those_of_one_round() -> None:
+    batch, cluster = scene()
+    model = ModelConfig(inference=InferenceConfig(motion_metric="given", iterations=6))
+    found = decode(batch, make_start(batch, MOTIONS), settings=model)
+    assert found.cluster[0].tolist() == cluster.tolist()
+    assert found.association[0].tolist() == list(range(batch.source.shape[1]))
+    assert found.converged.all()
+
+
+def test_associate_is_the_first_pass_over_the_association_chain() -> None:
+    batch, cluster = scene()
+    start, matching = make_start(batch, MOTIONS), InferenceConfig(motion_metric="given", iterations=1)
+    view = PairView.of(batch)
+    here = joint.associate(view, start, cluster[None], MODEL.fitted, matching)
+    assert here[0].tolist() == list(range(batch.source.shape[1]))
+    alone = start.background_alone()
+    one_motion = joint.associate(view, alone, torch.zeros_like(cluster)[None], MODEL.fitted, matching)
+    expected = decode(batch, alone, settings=ModelConfig(chains="matching", inference=matching)).association
+    assert torch.equal(one_motion, expected)
+    nobody = torch.full_like(cluster, -1)[None]  # outliers move with the background
+    assert torch.equal(joint.associate(view, alone, nobody, MODEL.fitted, matching), expected)

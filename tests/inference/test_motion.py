@@ -19,6 +19,7 @@ from torchcrf_scan.inference.motion import (
     largest_spread,
     retire_empty,
     soft_support,
+    trim,
 )
 
 METRICS = ("point", "line")
@@ -291,3 +292,42 @@ def test_running_sums_recover_known_motions() -> None:
     support = given_support(source, target, labels, 3)
     found = RunningSums.of(source, target, support.weights).motions(started(torch.zeros(1, 3, 3).double()), 0.1)
     assert_close(found[0], TRUE)
+
+
+# --- trimmed fits -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_trimming_recovers_a_motion_with_gross_outliers(seed: int) -> None:
+    n, wrong = 60, 9  # 15 %
+    source = make_points(n, seed)[None]
+    partner = se2.apply(TRUE[:1], source) + 1e-4 * normal(1, n, 2, seed=seed + 50)
+    partner[0, :: n // wrong][:wrong] += torch.tensor([4.0, -3.0]).double() + 0.5 * normal(wrong, 2, seed=seed)
+    support = given_support(source, partner, torch.zeros(1, n, dtype=torch.int64), 1)
+    kept = trim(source, support)
+    assert_close(kabsch(source, partner, kept.weights[:, 0]), TRUE[:1], tolerance=5e-4)
+    assert float(torch.linalg.vector_norm(kabsch(source, partner, support.weights[:, 0]) - TRUE[0])) > 0.2
+    assert int((kept.weights > 0).sum()) == 48
+    assert (kept.weights[0, 0, :: n // wrong][:wrong] == 0).all()
+
+
+def test_trimming_is_by_cluster_and_keeps_the_counts() -> None:
+    source, partner, labels = make_points(40, 1)[None], make_points(40, 2)[None], torch.arange(40)[None] % 4 - 1
+    support = given_support(source, partner, labels, 4)  # the last cluster has no point
+    kept = trim(source, support)
+    assert kept.weights.sum(-1).tolist() == [[8.0, 8.0, 8.0, 0.0]]
+    assert ((kept.weights == 0) | (kept.weights == support.weights)).all()
+    for name in ("partner", "tangent", "count", "spread"):
+        assert torch.equal(getattr(kept, name), getattr(support, name)), name
+    alone = given_support(source, partner, labels.masked_fill(labels != 1, -1), 4)
+    assert torch.equal(trim(source, alone).weights[:, 1], kept.weights[:, 1])
+
+
+@pytest.mark.parametrize("points", range(4))
+def test_trimming_very_few_points_leaves_some(points: int) -> None:
+    source = make_points(5, 1)[None]
+    labels = torch.where(torch.arange(5) < points, 0, -1)[None]
+    kept = trim(source, given_support(source, make_points(5, 2)[None], labels, 1))
+    assert kept.weights.isfinite().all()
+    assert int((kept.weights > 0).sum()) >= min(points, 1)
+    assert int((kept.weights > 0).sum()) == -(-4 * points // 5)

@@ -11,9 +11,9 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
 from torchcrf_scan.inference.hypothesis_features import FEATURES, hypothesis_features
-from torchcrf_scan.inference.movers import HypothesisScore, find_movers, select
+from torchcrf_scan.inference.movers import HypothesisScore, Movers, find_movers, select
 from torchcrf_scan.inference.surface import Surface
-from torchcrf_scan.learning.hypothesis_fit import IGNORED, fit_hypothesis_score, label_hypotheses, simulate_mixture
+from torchcrf_scan.learning.hypothesis_fit import IGNORED, fit_hypothesis_score, label_hypotheses, simulate_mixture, view_pair
 from torchcrf_scan.scan import ScanPair
 
 NOISE = torch.tensor(0.01)
@@ -50,6 +50,11 @@ def cast(segments: list[tuple[float, ...]], seed: int) -> Tensor:
     r = r + np.random.default_rng(seed).normal(0, 0.01, len(r))
     hit = np.isfinite(r)
     return torch.from_numpy(np.c_[r * dx[:, 0], r * dy[:, 0]][hit]).float()
+
+
+def movers_of(source: Surface, target: Surface, background: Tensor, dt: float, score: HypothesisScore) -> Movers:
+    hypotheses = hypothesise(source, target, background, dt)
+    return find_movers(hypotheses, hypothesis_features(hypotheses, source, target, background), source, target, score)
 
 
 def scene(moving: tuple[str, ...] = ("ahead", "across")) -> tuple[Surface, Surface]:
@@ -94,22 +99,21 @@ def test_the_pool_holds_both_movers() -> None:
 
 def test_two_objects_are_found_and_nothing_else() -> None:
     source, target = scene()
-    movers = find_movers(source, target, EGO, DT, HypothesisScore())
+    movers = movers_of(source, target, EGO, DT, HypothesisScore())
     assert len(movers.motions) == 2
     assert_found(movers.motions, source, {name: se2.compose(EGO, step) for name, step in STEPS.items()}, 0.1)
     assert (movers.probabilities.diff() <= 0).all()
 
 
 def test_what_stands_still_is_no_mover() -> None:
-    movers = find_movers(*scene(moving=()), EGO, DT, HypothesisScore())
+    movers = movers_of(*scene(moving=()), EGO, DT, HypothesisScore())
     assert len(movers.motions) == 0
 
 
 def test_most_scenes_without_movers_give_none() -> None:
     pairs = simulate_pairs(SimulatorConfig(movers_min=0, movers_max=0, beams=181), 8, 8, 5)
     found = [
-        len(find_movers(*surfaces(p), torch.tensor(p.annotation.motions[0]).float(), p.dt, HypothesisScore()).motions)
-        for p in pairs
+        len(movers_of(*surfaces(p), torch.tensor(p.annotation.motions[0]).float(), p.dt, HypothesisScore()).motions) for p in pairs
     ]
     assert sum(count == 0 for count in found) >= 6
 
@@ -120,7 +124,7 @@ def test_simulated_movers_are_found() -> None:
     for pair in pairs:
         source, target = surfaces(pair)
         motions = torch.from_numpy(pair.annotation.motions).float()
-        movers = find_movers(source, target, motions[0], pair.dt, HypothesisScore())
+        movers = movers_of(source, target, motions[0], pair.dt, HypothesisScore())
         body = torch.from_numpy(pair.annotation.body)
         label = label_hypotheses(Hypotheses(movers.motions, movers.members), source, body, motions, torch.tensor(0.1))
         right, accepted = right + int((label == 1).sum()), accepted + len(label)
@@ -133,8 +137,8 @@ def test_turning_the_target_frame_turns_the_motions() -> None:
     source, target = scene()
     turn = torch.tensor([0.4, 0.0, 0.0])
     turned = Surface.of(se2.apply(turn, target.points), NOISE, False)
-    here = find_movers(source, target, EGO, DT, HypothesisScore())
-    there = find_movers(source, turned, se2.compose(turn, EGO), DT, HypothesisScore())
+    here = movers_of(source, target, EGO, DT, HypothesisScore())
+    there = movers_of(source, turned, se2.compose(turn, EGO), DT, HypothesisScore())
     assert len(here.motions) == len(there.motions)
     torch.testing.assert_close(there.motions, se2.compose(turn.expand_as(here.motions), here.motions), atol=5e-3, rtol=0)
 
@@ -182,7 +186,7 @@ def test_hardly_any_points_give_no_movers(count: int, is_source: bool) -> None:
     few = Surface.of((source if is_source else target).points[: max(count, 1)], NOISE, False)
     few = few if count else empty(few)
     pair = (few, target) if is_source else (source, few)
-    movers = find_movers(*pair, EGO, DT, HypothesisScore())
+    movers = movers_of(*pair, EGO, DT, HypothesisScore())
     assert movers.motions.shape == (0, 3)
     assert movers.probabilities.shape == (0,)
     assert movers.members.shape == (0, len(pair[0]))
@@ -194,7 +198,7 @@ def test_a_perfect_background_leaves_no_hypotheses() -> None:
     pool = hypothesise(source, source, still, DT)
     assert len(pool) == 0
     assert hypothesis_features(pool, source, source, still).shape == (0, len(FEATURES))
-    assert len(find_movers(source, source, still, DT, HypothesisScore()).motions) == 0
+    assert len(movers_of(source, source, still, DT, HypothesisScore()).motions) == 0
 
 
 def test_labels_of_hypotheses() -> None:
@@ -213,18 +217,22 @@ def test_labels_of_hypotheses() -> None:
     assert label_hypotheses(pool, source, body, motions, torch.tensor(0.1)).tolist() == [-1, -1, 0, 0]
 
 
-def test_fit_needs_annotated_pairs_and_keeps_the_default_without_movers() -> None:
-    pair = simulate_pairs(SimulatorConfig(), 1, 1, 0)[0]
-    with pytest.raises(ValueError, match="annotated"):
-        fit_hypothesis_score([ScanPair(pair.source, pair.target)])
-    without_movers = fit_hypothesis_score([])
-    assert all(torch.equal(a, b) for a, b in zip(without_movers.buffers(), HypothesisScore().buffers(), strict=True))
+def test_the_fit_keeps_the_default_without_movers() -> None:
+    still = simulate_pairs(SimulatorConfig(beams=91, movers_min=0, movers_max=0), 1, 1, 0)[0]
+    seen = view_pair(still, seed=0, views=1)
+    assert len(seen[0].features) > 0
+    for views in ([], seen):
+        score = fit_hypothesis_score(views)
+        assert all(torch.equal(a, b) for a, b in zip(score.buffers(), HypothesisScore().buffers(), strict=True))
 
 
 def test_a_small_fit_ranks_unseen_hypotheses_and_repeats_itself() -> None:
     room = SimulatorConfig(scene="indoor", beams=120, range_max=10.0, movers_min=2)
-    one, other = (fit_hypothesis_score(simulate_pairs(room, 5, 5, 3), views=1, seed=4) for _ in range(2))
-    torch.testing.assert_close(one.weight, other.weight)
+    pairs = simulate_pairs(room, 3, 3, 3)
+    views = [view_pair(pair, 4 + k) for k, pair in enumerate(pairs)]
+    again = [view_pair(pairs[0], 4), *views[1:]]
+    one, other = (fit_hypothesis_score([view for of_pair in seen for view in of_pair]) for seen in (views, again))
+    torch.testing.assert_close(one.weight, other.weight, rtol=0, atol=0)
     assert one.threshold == other.threshold
     source, target = scene()
     pool = hypothesise(source, target, EGO, DT)

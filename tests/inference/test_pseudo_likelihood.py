@@ -7,13 +7,13 @@ import numpy as np
 import oracles
 import pytest
 import torch
-from support import assert_close, generator, make_points, normal
+from scenes import random_stumps
+from support import assert_close, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
 from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.features.candidates import with_targets
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import Scales
@@ -32,6 +32,7 @@ from torchcrf_scan.inference.pseudo_likelihood import (
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
 
 N, M, C = 6, 5, 3
+DENSE = InferenceConfig(candidates=0)
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3], [0.2, -0.2, -1.0]], dtype=torch.float64)
 ASSOCIATION = torch.tensor([[0, 1, -1, 2, 4, 3]])
 CLUSTER = torch.tensor([[0, 0, -1, 1, 1, 0]])
@@ -57,16 +58,6 @@ def tiny(seed: int = 0) -> ScanPairBatch:
         initial_motion=torch.tensor([[0.02, -0.1, 0.0]], dtype=torch.float64),
         truth=truth,
     )
-
-
-def random_stumps(ensemble: StumpEnsemble, seed: int) -> tuple[list[int], list[float], list[float], list[float]]:
-    """Fills the ensemble; returns (feature, threshold, left, right)."""
-    features, count = ensemble.thresholds.shape
-    feature = torch.randint(features, (count,), generator=generator(seed))
-    threshold = -9 * torch.rand(count, generator=generator(seed + 1))
-    left, right = normal(2, count, seed=seed).float()
-    ensemble.set_stumps(feature, threshold, left, right)
-    return feature.tolist(), threshold.tolist(), left.tolist(), right.tolist()
 
 
 def plugins_of(batch: ScanPairBatch) -> PlugIns:
@@ -109,7 +100,7 @@ def test_the_association_conditionals_equal_the_loops(seed: int) -> None:
     scales.local.mul_(10)  # else every error is as bad as any
     data, outlier = random_stumps(boosters.data, seed), random_stumps(boosters.outlier, seed + 7)
     plugins = plugins_of(batch)
-    design = association_design(PairView.of(batch), plugins, scales, boosters, 0)
+    design = association_design(PairView.of(batch), plugins, scales, boosters, DENSE)
 
     source, target = batch.source[0].numpy(), batch.target[0].numpy()
     own = plugins.cluster[0].clamp(min=0)
@@ -163,7 +154,7 @@ def test_the_joint_is_the_sum_of_both_chains() -> None:
     batch, scales, boosters = tiny(), Scales().double(), Boosters(1).double()
     parameters = Parameters(normal(18), normal(12, seed=1), scales, boosters)
     view, plugins = PairView.of(batch), plugins_of(batch)
-    first = association_design(view, plugins, scales, boosters, 8).log_likelihood(parameters.association).sum(-1)
+    first = association_design(view, plugins, scales, boosters, InferenceConfig()).log_likelihood(parameters.association).sum(-1)
     second = clustering_design(view, plugins, scales).log_likelihood(parameters.clustering).sum(-1)
     for chains, expected in (("joint", first + second), ("matching", first), ("clustering", second)):
         assert_close(pseudo_log_likelihood(view, plugins, parameters, ModelConfig(chains=chains)), expected)
@@ -202,7 +193,7 @@ def test_the_gradient_equals_central_differences(pairs: ScanPairBatch) -> None:
 def test_the_hessian_is_positive_definite_with_the_prior(pairs: ScanPairBatch, chain: str) -> None:
     view, plugins, scales = PairView.of(pairs), true_plugins(pairs, 7), Scales().double()
     design = (
-        association_design(view, plugins, scales, Boosters(1).double(), 8)
+        association_design(view, plugins, scales, Boosters(1).double(), InferenceConfig())
         if chain == "association"
         else clustering_design(view, plugins, scales)
     )
@@ -223,7 +214,7 @@ def test_the_hessian_is_positive_definite_with_the_prior(pairs: ScanPairBatch, c
 def designs(batch: ScanPairBatch) -> list[Design]:
     view, plugins = PairView.of(batch), true_plugins(batch, C)
     return [
-        association_design(view, plugins, Scales().double(), Boosters(1).double(), 0),
+        association_design(view, plugins, Scales().double(), Boosters(1).double(), DENSE),
         clustering_design(view, plugins, Scales().double()),
     ]
 

@@ -10,11 +10,13 @@ from sklearn.tree import DecisionTreeClassifier
 from support import generator, make_points
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import SimulatorConfig
+from torchcrf_scan.config import InferenceConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.features.potentials import OUTLIER_INPUTS, Boosters, PairView
-from torchcrf_scan.features.scales import Scales
+from torchcrf_scan.features.scales import LOCAL_CHANNELS, Scales
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
+from torchcrf_scan.learning import boosting_fit
 from torchcrf_scan.learning.boosting_fit import data_examples, fit_boosters, fit_stumps, outlier_examples, sample_targets
 
 
@@ -122,7 +124,7 @@ def test_ignored_points_are_no_examples(batch: ScanPairBatch) -> None:
     half = replace(batch, truth=replace(batch.truth, known=known))
     plugins = true_plugins(half, 7)
     nodes = int((known & plugins.known).sum())
-    inputs, positive = outlier_examples(PairView.of(half), plugins, Scales(), Boosters(3).data, 8)
+    inputs, positive = outlier_examples(PairView.of(half), plugins, Scales(), Boosters(3).data, InferenceConfig())
     assert inputs.shape == (nodes, OUTLIER_INPUTS)
     assert int(positive.sum()) == int((known & plugins.known & (batch.truth.association < 0)).sum())
     assert int(data_examples(PairView.of(half), plugins, Scales(), 4, generator(0))[1].sum()) == nodes - int(positive.sum())
@@ -130,12 +132,70 @@ def test_ignored_points_are_no_examples(batch: ScanPairBatch) -> None:
 
 def test_boosters_tell_right_from_wrong(batch: ScanPairBatch) -> None:
     views, plugins = [PairView.of(batch)], [true_plugins(batch, 7)]
-    settings = {"stumps": 20, "negatives": 4, "candidates": 8}
+    settings = {"stumps": 20, "negatives": 4, "inference": InferenceConfig(), "most": 0, "hidden": ()}
     boosters = fit_boosters(views, plugins, Scales(), **settings, generator=generator(0))
     inputs, positive = data_examples(views[0], plugins[0], Scales(), 4, generator(5))
     assert ((boosters.data(inputs) > 0) == positive).float().mean() > 0.85
-    inputs, positive = outlier_examples(views[0], plugins[0], Scales(), boosters.data, 8)
+    inputs, positive = outlier_examples(views[0], plugins[0], Scales(), boosters.data, InferenceConfig())
     assert ((boosters.outlier(inputs) > 0) == positive).float().mean() > 0.8
     again = fit_boosters(views, plugins, Scales(), **settings, generator=generator(0))
     for name, value in boosters.state_dict().items():
         assert torch.equal(again.state_dict()[name], value), name
+
+
+def boosters_of(batch: ScanPairBatch, *, most: int = 0, hidden: tuple[int, ...] = (), seed: int = 0) -> Boosters:
+    return fit_boosters(
+        [PairView.of(batch)],
+        [true_plugins(batch, 7)],
+        Scales(),
+        stumps=20,
+        negatives=4,
+        inference=InferenceConfig(),
+        most=most,
+        hidden=hidden,
+        generator=generator(seed),
+    )
+
+
+@pytest.mark.parametrize("hidden", [(0,), (11, 3, 9)])
+def test_no_stump_looks_at_a_hidden_channel(batch: ScanPairBatch, hidden: tuple[int, ...]) -> None:
+    boosters, seeing = boosters_of(batch, hidden=hidden), boosters_of(batch)
+    for name, width in (("data", len(LOCAL_CHANNELS)), ("outlier", OUTLIER_INPUTS)):
+        inputs = -9 * torch.rand(200, width, generator=generator(3))
+        changed = inputs.clone()
+        changed[:, list(hidden)] = -9 * torch.rand(200, len(hidden), generator=generator(4))
+        blind = getattr(boosters, name)
+        assert torch.equal(blind(inputs), blind(changed)), name
+        assert blind(inputs).unique().numel() > 2, name
+    assert not torch.equal(seeing.data(inputs[:, :12]), seeing.data(changed[:, :12])) or hidden == (0,)
+
+
+def test_more_examples_than_there_are_is_all_of_them(batch: ScanPairBatch) -> None:
+    everything, enough = boosters_of(batch), boosters_of(batch, most=100_000)
+    for name, value in everything.state_dict().items():
+        assert torch.equal(enough.state_dict()[name], value), name
+
+
+def test_few_examples_are_drawn_at_random(batch: ScanPairBatch, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def watch(inputs: np.ndarray, positive: np.ndarray, stumps: int) -> StumpEnsemble:
+        seen.append((inputs, positive))
+        return fit_stumps(inputs, positive, stumps)
+
+    monkeypatch.setattr(boosting_fit, "fit_stumps", watch)
+    for most, seed in ((0, 0), (60, 0), (60, 0), (60, 1)):
+        boosters_of(batch, most=most, seed=seed)
+    every, one, same, other = (seen[k][0] for k in (0, 2, 4, 6))
+    assert len(every) > len(one) == len(other) == len(seen[3][0]) == 60
+    assert np.array_equal(one, same)
+    assert not np.array_equal(one, other)
+    rows = {row.tobytes() for row in every}
+    assert all(row.tobytes() in rows for row in one)
+    assert 0 < seen[2][1].sum() < 60
+
+
+def test_few_examples_still_tell_right_from_wrong(batch: ScanPairBatch) -> None:
+    inputs, positive = data_examples(PairView.of(batch), true_plugins(batch, 7), Scales(), 4, generator(5))
+    found = boosters_of(batch, most=300).data(inputs) > 0
+    assert (found == positive).float().mean() > 0.8

@@ -9,10 +9,12 @@ import torch
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, LearningConfig, ModelConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS
+from torchcrf_scan.inference.movers import HypothesisScore
 from torchcrf_scan.inference.pseudo_likelihood import pseudo_log_likelihood
-from torchcrf_scan.learning.fit import Material, assign_folds, fit, fit_all_boosters, gather_material, prepare, set_weights
+from torchcrf_scan.learning.fit import fit, fit_all_boosters, prepare, set_weights
+from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
-from torchcrf_scan.scan import Scan, ScanPair
+from torchcrf_scan.scan import ScanPair
 
 LEARNING = LearningConfig(folds=2, negatives=3, batch_size=2)
 MODEL = ModelConfig(features=FeatureConfig(stumps=15), inference=InferenceConfig(clusters=6))
@@ -25,7 +27,7 @@ def pairs() -> list[ScanPair]:
 
 @pytest.fixture(scope="module")
 def material(pairs: list[ScanPair]) -> list[Material]:
-    return gather_material(JointScanCRF(MODEL), pairs, LEARNING)
+    return collect(pairs, LEARNING).material(range(len(pairs)), HypothesisScore(), 5, LEARNING)
 
 
 @pytest.fixture(scope="module")
@@ -33,45 +35,6 @@ def fitted(material: list[Material]) -> JointScanCRF:
     model = JointScanCRF(MODEL)
     fit(model, material, LEARNING)
     return model
-
-
-def named(*sequences: str) -> list[ScanPair]:
-    scan = Scan.from_ranges([1.0], [0.0])
-    return [ScanPair(scan, scan, sequence=sequence) for sequence in sequences]
-
-
-@pytest.mark.parametrize("folds", [1, 2, 3, 5])
-def test_folds_keep_sequences_whole(folds: int) -> None:
-    pairs = named(*"aaaabbbccdddddeffg")
-    numbers = assign_folds(pairs, folds)
-    assert sorted(set(numbers)) == list(range(folds))
-    for sequence in "abcdefg":
-        assert len({number for pair, number in zip(pairs, numbers, strict=True) if pair.sequence == sequence}) == 1
-    sizes = [numbers.count(number) for number in range(folds)]
-    assert max(sizes) - min(sizes) <= 5
-
-
-@pytest.mark.parametrize("folds", [0, 1])
-def test_no_folds_are_one(folds: int) -> None:
-    assert assign_folds(named("a", "b", "a"), folds) == [0, 0, 0]
-
-
-def test_no_more_folds_than_sequences() -> None:
-    assert sorted(assign_folds(named("a", "b", "a"), 5)) == [0, 0, 1]
-
-
-def test_material_is_batches_of_one_fold(pairs: list[ScanPair], material: list[Material]) -> None:
-    assert sum(len(part.batch) for part in material) == len(pairs)
-    assert all(len(part.batch) <= LEARNING.batch_size for part in material)
-    assert {part.fold for part in material} == {0, 1}
-    assert all(part.start.motions.shape == (len(part.batch), 5, 3) for part in material)
-
-
-def test_pairs_without_annotation_are_refused(pairs: list[ScanPair]) -> None:
-    with pytest.raises(ValueError, match=f"pairs: expected annotated pairs, got .*{pairs[1].name}"):
-        gather_material(JointScanCRF(MODEL), [pairs[0], replace(pairs[1], annotation=None)], LEARNING)
-    with pytest.raises(ValueError, match="pairs: expected annotated pairs, got none"):
-        gather_material(JointScanCRF(MODEL), [], LEARNING)
 
 
 def test_a_folds_boosters_have_not_seen_it(material: list[Material]) -> None:
@@ -163,3 +126,36 @@ def test_set_weights_follows_the_names() -> None:
     assert [model.clustering_weights[name].item() for name in CLUSTERING_WEIGHTS] == list(range(12))
     with pytest.raises(ValueError, match="zip"):
         set_weights(model, "clustering", torch.arange(18.0))
+
+
+@pytest.mark.parametrize("layer", [MatchingCRF, ClusteringCRF])
+def test_what_is_left_out_is_not_learned(layer: type[JointScanCRF], material: list[Material]) -> None:
+    left_out = (
+        "association.geo1",
+        "association.sequence",
+        "association.data_boosting",
+        "clustering.outlier",
+        "clustering.sequence",
+    )
+    model = layer(replace(MODEL, features=FeatureConfig(stumps=10, left_out=left_out)))
+    fit(model, material[:2], LEARNING)
+    chain, names = ("association", ASSOCIATION_WEIGHTS) if layer is MatchingCRF else ("clustering", CLUSTERING_WEIGHTS)
+    learned = dict(zip(names, model.weight_vectors[chain == "clustering"].tolist(), strict=True))
+    assert {f"{chain}.{name}" for name, value in learned.items() if value == 0} == {
+        name for name in left_out if name.startswith(chain)
+    }
+    inputs = -9 * torch.rand(100, len(LOCAL_CHANNELS))
+    changed = inputs.clone()
+    changed[:, LOCAL_CHANNELS.index("geo1")] = 0.0
+    assert torch.equal(model.boosters.data(inputs), model.boosters.data(changed))
+
+
+def test_a_lattice_does_not_learn_what_is_left_out(material: list[Material]) -> None:
+    left_out = ("association.translation", "clustering.pairwise_outlier")
+    model = JointScanCRF(replace(MODEL, coupling="lattice", features=FeatureConfig(stumps=4, left_out=left_out)))
+    fit(model, material[:1], replace(LEARNING, max_steps=4))
+    dead = [
+        [name for name, value in zip(names, weights.tolist(), strict=True) if value == 0]
+        for names, weights in zip((ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS), model.weight_vectors, strict=True)
+    ]
+    assert dead == [["translation"], ["pairwise_outlier"]]

@@ -63,6 +63,11 @@ def local_features(at: Correspondence, active: Tensor, scales: Scales) -> Tensor
     return torch.cat([clusters, outlier[:, :, None]], dim=2)
 
 
+def elasticity(stretch: Tensor, scales: Scales) -> tuple[Tensor, Tensor]:
+    """Stiffness (a kernel) and minus the robust square of what an edge gained in length (A-16)."""
+    return torch.exp(-((stretch / scales.neighbour_distance) ** 2)), robust_square(stretch, scales.neighbour_distance)
+
+
 def pairwise_features(source_points: Tensor, at: Correspondence, scales: Scales) -> Tensor:
     """Q1..Q8 on every edge (i, i+1); stiffness and elongation need both ends associated (spec 4.2). Returns (B, N-1, D, D, 8)."""
     C = at.moved.shape[2]
@@ -72,8 +77,8 @@ def pairwise_features(source_points: Tensor, at: Correspondence, scales: Scales)
     across = torch.linalg.vector_norm(at.moved[:, 1:, None, :] - at.moved[:, :-1, :, None], dim=-1)  # (B, E, C, C)
 
     near = torch.exp(-((d1 / scales.neighbour_weight) ** 2))
-    stiff = torch.exp(-(((d2 - d1) / scales.neighbour_distance) ** 2))
-    elongation = robust_square(d2 - d1, scales.neighbour_distance) * both
+    stiff, elongation = elasticity(d2 - d1, scales)
+    elongation = elongation * both
     parting = robust_square(across - d1[..., None, None], scales.neighbour_distance)
 
     same = torch.eye(C, dtype=d1.dtype, device=d1.device)  # (C, C)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.features import association
+from torchcrf_scan.config import InferenceConfig
+from torchcrf_scan.features import association, candidates
 from torchcrf_scan.features.boosting import StumpEnsemble
+from torchcrf_scan.features.candidates import Candidates
 from torchcrf_scan.features.scales import LOCAL_CHANNELS, STATIC_CHANNELS, Scales
 from torchcrf_scan.features.shape import ShapeDescriptors, describe, local_spacing
 from torchcrf_scan.geometry import se2
@@ -110,7 +112,13 @@ def association_unary(
 
     moved: (B, N, 2) source points under their own motion. Returns (B, N, K+1, 14).
     """
-    registered = association.registered_feature(moved, target_points, states.candidates, scales)[..., None]
+    registered = association.registered_feature(moved, target_points, states.candidates, scales)
+    return unary_at(states, registered, scales, boosters)
+
+
+def unary_at(states: AssociationStates, registered: Tensor, scales: Scales, boosters: Boosters) -> Tensor:
+    """`association_unary` from the registered channel (B, N, K) of the candidates."""
+    registered = registered[..., None]
     local = torch.cat([states.static, registered], dim=-1)  # (B, N, K, 12)
     margin = states.static_margin + boosters.data.margins(registered, first=STATIC_CHANNELS)
     outlier_margin = boosters.outlier(association.outlier_inputs(local, margin, states.candidates, states.mask))  # (B, N)
@@ -156,3 +164,28 @@ def clustering_potentials(local: Tensor, pairwise: Tensor, possible: Tensor, wei
     """
     log_unary = (local @ weights[:4]).masked_fill(~possible, -torch.inf)
     return log_unary, pairwise @ weights[4:]
+
+
+def find_candidates(view: PairView, motions: Tensor, active: Tensor, config: InferenceConfig) -> Candidates:
+    """The association chain's inlier states, `config.candidates` of them or all (0), and the nearest target under every motion.
+
+    motions: (B, C, 3), active: (B, C): those that the candidates are near to (`motion`); else they serve `nearest` alone.
+    """
+    batch = view.batch
+    scans = (batch.source, batch.target, batch.target_mask)
+    if config.candidate_search == "motion" or config.candidates == 0:
+        return candidates.by_motion(*scans, motions, active, config.candidates)
+    nearest = candidates.by_motion(*scans, motions, active, 1).nearest
+    if config.candidate_search == "position":
+        guess = batch.initial_motion[:, None]
+        found = candidates.by_motion(*scans, guess, torch.ones_like(active[:, :1]), config.candidates)
+        return replace(found, nearest=nearest)
+    return Candidates(*candidates.by_score(shape_score(view), batch.target_mask, config.candidates), nearest)
+
+
+@torch.no_grad()
+def shape_score(view: PairView) -> Tensor:
+    """(B, N, M) how alike the surroundings of two points are: mean of L1..L9 with the scales of a street scanner."""
+    every, _ = candidates.every_target(view.batch.source, view.batch.target_mask)
+    scales = Scales().to(view.batch.source)
+    return association.shape_features(view.source_shape, view.target_shape, every, scales).mean(-1)

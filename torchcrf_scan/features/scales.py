@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
+
+if TYPE_CHECKING:
+    from torchcrf_scan.config import FeatureConfig
 
 KAPPA = 9.0  # an error of three standard deviations is as bad as any (spec 0.1)
 
@@ -29,6 +34,15 @@ CLUSTERING_WEIGHTS = (
     ),
     *("neighbour_distance_same", "neighbour_distance_different", "pairwise_outlier"),
 )  # c01..c12
+
+
+def live_weights(config: FeatureConfig) -> tuple[Tensor, Tensor]:
+    """(18,) and (12,): 1 for the weights that the model has, 0 for those that stay 0 (raw channels in W-B, what is left out)."""
+    association = [name not in LOCAL_CHANNELS or config.raw_channels for name in ASSOCIATION_WEIGHTS]
+    for k, name in enumerate(ASSOCIATION_WEIGHTS):
+        association[k] &= f"association.{name}" not in config.left_out
+    clustering = [f"clustering.{name}" not in config.left_out for name in CLUSTERING_WEIGHTS]
+    return torch.tensor(association, dtype=torch.float64), torch.tensor(clustering, dtype=torch.float64)
 
 
 def robust_square(error: Tensor, scale: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.features import association, candidates
-from torchcrf_scan.features.potentials import PairView, state_mask
+from torchcrf_scan.features.potentials import PairView, shape_score, state_mask
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
@@ -17,14 +17,14 @@ OUTLIER_SCORE = -3.0  # mean channel value below which a place is no better than
 SAMPLES = 256
 
 
-def shape_association(view: PairView, scales: Scales) -> Tensor:
+def shape_association(view: PairView) -> Tensor:
     """(B, N) associations, -1 outlier, of a chain that knows shapes and distances along the scan, not positions.
 
-    Unchanged when either scan moves. Costs N M for the choice of candidates.
+    Nothing in it is learned: in a view in the unit `spacing` the default scales fit any scanner. Unchanged when either scan moves.
+    Costs N M for the choice of candidates.
     """
-    batch = view.batch
-    every, _ = candidates.every_target(batch.source, batch.target_mask)
-    score = association.shape_features(view.source_shape, view.target_shape, every, scales).mean(-1)  # (B, N, M)
+    batch, scales = view.batch, Scales().to(view.batch.source)
+    score = shape_score(view)  # (B, N, M)
     index, mask = candidates.by_score(score, batch.target_mask, CANDIDATES)
     log_unary = torch.cat([score.gather(-1, index), score.new_full((*score.shape[:2], 1), OUTLIER_SCORE)], dim=-1)
     log_unary = log_unary.masked_fill(~state_mask(mask), -torch.inf)

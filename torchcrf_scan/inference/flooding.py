@@ -23,6 +23,7 @@ from torchcrf_scan.features.potentials import (
     association_potentials,
     association_unary,
     clustering_potentials,
+    find_candidates,
     possible_clusters,
     registered_points,
     state_mask,
@@ -89,7 +90,7 @@ class Flooding:
         """One visit to every node of every chain that the model has."""
         batch = self.view.batch
         self.sums = self._running_sums()
-        found = joint.find_candidates(self.view, self.state.motions.value, self.state.motions.active, self.config)
+        found = find_candidates(self.view, self.state.motions.value, self.state.motions.active, self.config)
         order = range(batch.source.shape[1] - 1, -1, -1) if descending else range(batch.source.shape[1])
         if self.model.chains != "matching":
             for i in order:
@@ -132,7 +133,7 @@ class Flooding:
         log_cluster = state.log_cluster.clone()
         log_cluster[:, here] = self._normalised(belief)[:, None]
         cluster = state.cluster.clone()
-        cluster[:, here] = joint.cluster_labels(belief[:, None], batch.source_mask[:, here])
+        cluster[:, here] = joint.cluster_labels(belief[:, None].argmax(-1), belief.shape[-1] - 1, batch.source_mask[:, here])
         self._relabel(i, replace(state, log_cluster=log_cluster, cluster=cluster))
 
     def visit_association(self, i: int) -> None:
@@ -150,7 +151,7 @@ class Flooding:
         log_association = state.log_association.clone()
         log_association[:, here] = self._normalised(belief)[:, None]
         association = state.association.clone()
-        association[:, here] = joint.association_labels(belief[:, None], states.candidates, batch.source_mask[:, here])
+        association[:, here] = joint.association_labels(belief[:, None].argmax(-1), states.candidates, batch.source_mask[:, here])
         state = replace(state, log_association=log_association, association=association)
         if self.model.chains == "matching":
             state = joint.inliers_are_background(state)

@@ -1,12 +1,13 @@
 """InitialiseRT: where the iterations start (Algorithm 1, line 1). It decides the result, so it is looked for with care.
 
-Background: shape-only matching with RANSAC and registrations from a grid of starts, the best by what it leaves unexplained over
-the whole scene (`background.py`). Movers: hypothesised motions of segments that the background does not explain (`movers.py`).
-No gradient passes through the start.
+`survey` looks at the scans: the background by shape-only matching with RANSAC and registrations from a grid of starts, the best by
+what it leaves unexplained over the whole scene (`background.py`), and the hypothesised motions of what it does not explain
+(`hypotheses.py`). `choose` accepts movers among them by the learned score (`movers.py`). No gradient passes through the start.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,10 +16,11 @@ from torch import Tensor
 from torchcrf_scan.batch import ScanPairBatch, scale_motions
 from torchcrf_scan.features.candidates import squared_distances
 from torchcrf_scan.features.potentials import PairView, possible_clusters, resolution
-from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.background import background_pool, unit_length
 from torchcrf_scan.inference.cold import ransac_motions, shape_association
+from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
+from torchcrf_scan.inference.hypothesis_features import hypothesis_features
 from torchcrf_scan.inference.movers import HypothesisScore, find_movers
 from torchcrf_scan.inference.surface import Surface
 
@@ -55,27 +57,63 @@ class Start:
         return replace(self, motions=scale_motions(self.motions, factor))
 
 
-@torch.no_grad()
-def initialise(batch: ScanPairBatch, scales: Scales, score: HypothesisScore, clusters: int) -> Start:
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What the scans of one pair say before anything learned is asked; it costs nearly all the time of InitialiseRT.
+
+    Attributes:
+        source, target: surfaces of N and M points.
+        background: (3,) the background's motion.
+        hypotheses: H motions that movers may have. features: (H, F) what `HypothesisScore` judges them by.
+    """
+
+    source: Surface
+    target: Surface
+    background: Tensor
+    hypotheses: Hypotheses
+    features: Tensor
+
+
+def initialise(batch: ScanPairBatch, score: HypothesisScore, clusters: int) -> Start:
     """Background and up to `clusters` - 1 movers of every pair; `batch.initial_motion` is one more guess, not trusted blindly."""
-    shape_matches = shape_association(PairView.of(batch), scales)
+    return choose(batch, survey(batch), score, clusters)
+
+
+@torch.no_grad()
+def survey(batch: ScanPairBatch) -> list[Survey | None]:
+    """Surfaces, background and hypotheses of every pair; None where a scan has fewer than three points."""
+    shape_matches = shape_association(PairView.of(batch, length_unit="spacing"))
+    found: list[Survey | None] = []
+    for b in range(len(batch)):
+        n, m = int(batch.source_mask[b].sum()), int(batch.target_mask[b].sum())
+        if min(n, m) < FEWEST_POINTS:
+            found.append(None)
+            continue
+        source = Surface.of(batch.source[b, :n], batch.range_noise[b], bool(batch.source_closed[b]))
+        target = Surface.of(batch.target[b, :m], batch.range_noise[b], bool(batch.target_closed[b]))
+        background = find_background(source, target, batch.initial_motion[b], shape_matches[b, :n])
+        hypotheses = hypothesise(source, target, background, float(batch.dt[b]))
+        features = hypothesis_features(hypotheses, source, target, background)
+        found.append(Survey(source, target, background, hypotheses, features))
+    return found
+
+
+@torch.no_grad()
+def choose(batch: ScanPairBatch, surveys: Sequence[Survey | None], score: HypothesisScore, clusters: int) -> Start:
+    """The start from what was surveyed: the background and the up to `clusters` - 1 movers that the score accepts."""
     motions = batch.initial_motion[:, None].repeat(1, clusters, 1)
     active = torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
     active[:, 0] = True
     members = torch.zeros(len(batch), clusters, batch.source.shape[1], dtype=torch.bool, device=motions.device)
     tangents = torch.zeros_like(batch.target)
-    for b in range(len(batch)):
-        n, m = int(batch.source_mask[b].sum()), int(batch.target_mask[b].sum())
-        if min(n, m) < FEWEST_POINTS:
+    for b, seen in enumerate(surveys):
+        if seen is None:
             continue
-        source = Surface.of(batch.source[b, :n], batch.range_noise[b], bool(batch.source_closed[b]))
-        target = Surface.of(batch.target[b, :m], batch.range_noise[b], bool(batch.target_closed[b]))
-        background = find_background(source, target, batch.initial_motion[b], shape_matches[b, :n])
-        found = find_movers(source, target, background, float(batch.dt[b]), score, most=clusters - 1)
+        found = find_movers(seen.hypotheses, seen.features, seen.source, seen.target, score, most=clusters - 1)
         slots = slice(1, 1 + len(found.motions))
-        motions[b, 0], motions[b, slots], active[b, slots] = background, found.motions, True
-        members[b, slots, :n] = found.members
-        tangents[b, :m] = target.tangent
+        motions[b, 0], motions[b, slots], active[b, slots] = seen.background, found.motions, True
+        members[b, slots, : len(seen.source)] = found.members
+        tangents[b, : len(seen.target)] = seen.target.tangent
     reach = within_reach(batch.source, members, resolution(batch))
     return Start(motions, active, nearest_association(batch, motions, active, reach), tangents, reach)
 

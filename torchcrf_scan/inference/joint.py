@@ -14,10 +14,10 @@ from torch import Tensor
 
 from torchcrf_scan.batch import Prediction
 from torchcrf_scan.config import InferenceConfig, ModelConfig
-from torchcrf_scan.features import candidates as candidate_search
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.association import pairwise_features
 from torchcrf_scan.features.candidates import Candidates, with_targets
+from torchcrf_scan.features.lattice import lattice_features
 from torchcrf_scan.features.potentials import (
     AssociationStates,
     Boosters,
@@ -25,14 +25,16 @@ from torchcrf_scan.features.potentials import (
     association_potentials,
     association_unary,
     clustering_potentials,
+    find_candidates,
     possible_clusters,
     registered_points,
 )
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.lattice import lattice_beliefs
 from torchcrf_scan.inference.messages import chain_beliefs
-from torchcrf_scan.inference.motion import Motions, estimate, hard_support, retire_empty, soft_support
+from torchcrf_scan.inference.motion import Motions, estimate, hard_support, retire_empty, soft_support, trim
 
 MERGE_ROTATION = 0.01  # radians
 ROBUST_SHARE = 0.3  # of a point's usual residual: across a surface errors are smaller than from point to point
@@ -76,7 +78,7 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
     converged = torch.zeros(len(batch), dtype=torch.bool, device=batch.source.device)
     iterations = torch.zeros(len(batch), dtype=torch.int64, device=batch.source.device)
     for _ in range(config.iterations):
-        after = step(view, start, state, parameters, config, model.chains)
+        after = step(view, start, state, parameters, config, model.chains, model.coupling)
         if config.stop_early:
             after = damp(after, state, older)
             after = keep_settled(after, state, converged)
@@ -114,17 +116,24 @@ def first_state(view: PairView, start: Start, parameters: Parameters, config: In
     )
 
 
-def find_candidates(view: PairView, motions: Tensor, active: Tensor, config: InferenceConfig) -> Candidates:
-    """The association chain's inlier states under the present motions; `config.candidates` of them, or all (0)."""
-    batch = view.batch
-    return candidate_search.by_motion(batch.source, batch.target, batch.target_mask, motions, active, config.candidates)
-
-
 def step(
-    view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig, chains: str = "joint"
+    view: PairView,
+    start: Start,
+    state: State,
+    parameters: Parameters,
+    config: InferenceConfig,
+    chains: str = "joint",
+    coupling: str = "motions",
 ) -> State:
-    """One round: clustering chain, motions, association chain, motions. A chain that is not in `chains` is left out."""
+    """One round: clustering chain, motions, association chain, motions. A chain that is not in `chains` is left out.
+
+    With `coupling` lattice: both chains as one, motions.
+    """
     found = find_candidates(view, state.motions.value, state.motions.active, config)
+    if coupling == "lattice":
+        state = update_lattice(view, start, state, found, parameters, config)
+        state = update_motions(view, start, state, parameters, config)
+        return replace(state, motions=retire_empty(state.motions, count_points(state)))
     if chains != "matching":
         state = update_clusters(view, start, state, found, parameters, config)
         state = update_motions(view, start, state, parameters, config)
@@ -132,7 +141,7 @@ def step(
         state = update_association(view, state, found, parameters, config)
         if chains == "matching":
             state = inliers_are_background(state)
-        state = update_motions(view, start, state, parameters, config)
+        state = update_motions(view, start, state, parameters, config, trimmed=chains == "matching")
     return replace(state, motions=retire_empty(state.motions, count_points(state)))
 
 
@@ -160,13 +169,13 @@ def update_clusters(
     possible = possible_clusters(state.motions.active, start.reach, batch.source.shape[1])
     potentials = clustering_potentials(local, pairwise, possible, parameters.clustering)
     log_cluster = chain_beliefs(*potentials, batch.source_mask, config.temperature)
-    return replace(state, log_cluster=log_cluster, cluster=cluster_labels(log_cluster, batch.source_mask))
+    labels = cluster_labels(log_cluster.argmax(-1), log_cluster.shape[-1] - 1, batch.source_mask)
+    return replace(state, log_cluster=log_cluster, cluster=labels)
 
 
-def cluster_labels(log_cluster: Tensor, mask: Tensor) -> Tensor:
-    """(B, N) best cluster, -1 for the outlier and for padding."""
-    best = log_cluster.argmax(-1)
-    return best.masked_fill((best == log_cluster.shape[-1] - 1) | ~mask, -1)
+def cluster_labels(best: Tensor, outlier: int, mask: Tensor) -> Tensor:
+    """(B, N) cluster of the best state, -1 for the outlier and for padding. best: (B, N)."""
+    return best.masked_fill((best == outlier) | ~mask, -1)
 
 
 def update_association(view: PairView, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig) -> State:
@@ -178,23 +187,59 @@ def update_association(view: PairView, state: State, found: Candidates, paramete
     pairwise = pairwise_features(batch.source, batch.target, found.index, scales)
     potentials = association_potentials(unary, pairwise, found.mask, parameters.association)
     log_association = chain_beliefs(*potentials, batch.source_mask, config.temperature)
-    labels = association_labels(log_association, found.index, batch.source_mask)
+    labels = association_labels(log_association.argmax(-1), found.index, batch.source_mask)
     return replace(state, candidates=found.index, candidate_mask=found.mask, log_association=log_association, association=labels)
 
 
-def association_labels(log_association: Tensor, candidates: Tensor, mask: Tensor) -> Tensor:
-    """(B, N) target point of the best state, -1 for the outlier and for padding."""
+def associate(view: PairView, start: Start, cluster: Tensor, parameters: Parameters, config: InferenceConfig) -> Tensor:
+    """(B, N) associations of one exact pass over the association chain at the start's motions. cluster: (B, N), -1 outlier."""
+    state = first_state(view, start, parameters, config)
+    one_hot = torch.nn.functional.one_hot(cluster.clamp(min=0), start.motions.shape[1] + 1).to(start.motions)
+    found = find_candidates(view, start.motions, start.active, config)
+    return update_association(view, replace(state, log_cluster=one_hot), found, parameters, config).association
+
+
+def association_labels(best: Tensor, candidates: Tensor, mask: Tensor) -> Tensor:
+    """(B, N) target point of the best state, -1 for the outlier and for padding. best: (B, N)."""
     padded = torch.cat([candidates, torch.full_like(candidates[..., :1], -1)], dim=-1)
-    return padded.gather(-1, log_association.argmax(-1, keepdim=True))[..., 0].masked_fill(~mask, -1)
+    return padded.gather(-1, best[..., None])[..., 0].masked_fill(~mask, -1)
 
 
-def update_motions(view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig) -> State:
-    """ComputeRT."""
+def update_lattice(
+    view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig
+) -> State:
+    """An exact pass over the chain of super-nodes, which decides both labels of a point at once (spec 7.7)."""
+    batch, motions = view.batch, state.motions
+    states = AssociationStates.of(view, found.index, found.mask, parameters.scales, parameters.boosters)
+    possible = possible_clusters(motions.active, start.reach, batch.source.shape[1])
+    features = lattice_features(view, states, motions.value, found.nearest, possible, parameters.scales, parameters.boosters)
+    potentials = features.potentials(torch.cat([parameters.association, parameters.clustering]))
+    beliefs = lattice_beliefs(potentials, batch.source_mask, config.temperature)
+    place, cluster = beliefs.best()
+    return replace(
+        state,
+        association=association_labels(place, found.index, batch.source_mask),
+        cluster=cluster_labels(cluster, possible.shape[-1] - 1, batch.source_mask),
+        candidates=found.index,
+        candidate_mask=found.mask,
+        log_association=beliefs.log_association,
+        log_cluster=beliefs.log_cluster,
+    )
+
+
+def update_motions(
+    view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig, *, trimmed: bool = False
+) -> State:
+    """ComputeRT. trimmed: Kabsch leaves out the worst fifth, for a cluster that holds movers as well (spec 9.2)."""
+    if config.motion_metric == "given":
+        return state
     batch = view.batch
     geometry = (batch.source, batch.target, start.target_tangents)
     support = hard_support(*geometry, state.association, state.cluster, state.motions.value.shape[1])
     if config.motion_weights == "soft":
         support = soft_support(*geometry, support, state.candidates, state.log_association, state.log_cluster)
+    if trimmed and config.motion_metric == "point":
+        support = trim(batch.source, support)
     scale = ROBUST_SHARE * parameters.scales.cluster_distance
     motions = estimate(batch.source, support, state.motions, metric=config.motion_metric, scale=scale, min_extent=config.min_extent)
     return replace(state, motions=motions)

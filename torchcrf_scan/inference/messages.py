@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -56,11 +58,55 @@ def chain_messages(log_unary: Tensor, log_pairwise: Tensor, temperature: float =
 
 
 def log_partition(log_unary: Tensor, log_pairwise: Tensor, temperature: float = 1.0) -> Tensor:
-    """(B,) log of the summed (temperature 0: of the largest) score of all labellings. Arguments as in `chain_messages`."""
-    message = log_unary[:, 0]
-    for i in range(1, log_unary.shape[1]):
-        message = reduce_states(message[:, :, None] + log_pairwise[:, i - 1], 1, temperature) + log_unary[:, i]
-    return reduce_states(message, -1, temperature)
+    """(B,) log of the summed (temperature 0: of the largest) score of all labellings. Arguments as in `chain_messages`.
+
+    Above temperature 0 its gradient are the marginals, from a second pass; it is not differentiable twice.
+    """
+    if temperature > 0:
+        return _LogPartition.apply(log_unary, log_pairwise, temperature)[0]
+    return _running_totals(log_unary, log_pairwise, temperature)[-1]
+
+
+def _running_totals(log_unary: Tensor, log_pairwise: Tensor, temperature: float) -> list[Tensor]:
+    """N tensors (B, S), the summed score of everything up to a node in every state of it; and last the (B,) total."""
+    totals = [log_unary[:, 0]]
+    for node, edge in zip(log_unary.unbind(1)[1:], log_pairwise.unbind(1), strict=True):
+        totals.append(reduce_states(totals[-1][:, :, None] + edge, 1, temperature) + node)
+    return [*totals, reduce_states(totals[-1], -1, temperature)]
+
+
+class _LogPartition(torch.autograd.Function):
+    """The total, and as its gradient the marginals of nodes and edges: several times as fast as going back through N steps."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(log_unary: Tensor, log_pairwise: Tensor, temperature: float) -> tuple[Tensor, Tensor]:
+        *ahead, total = _running_totals(log_unary, log_pairwise, temperature)
+        return total, torch.stack(ahead, dim=1)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, float], output: tuple[Tensor, Tensor]) -> None:
+        log_unary, log_pairwise, ctx.temperature = inputs
+        total, ahead = output
+        ctx.mark_non_differentiable(ahead)
+        ctx.save_for_backward(log_unary, log_pairwise, ahead, total)
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor, _: Tensor) -> tuple[Tensor, Tensor, None]:
+        log_unary, log_pairwise, ahead, total = ctx.saved_tensors
+        back = _running_totals(log_unary.flip(1), log_pairwise.flip(1).mT, ctx.temperature)[:-1]
+        after = torch.stack(back, dim=1).flip(1)  # (B, N, S)
+        edges = ahead[:, :-1, :, None] + log_pairwise + after[:, 1:, None]
+        nodes = ahead + after - torch.where(log_unary > -torch.inf, log_unary, torch.zeros_like(log_unary))
+        return _share(nodes, total, slope, ctx.temperature), _share(edges, total, slope, ctx.temperature), None
+
+
+def _share(log_scores: Tensor, total: Tensor, slope: Tensor, temperature: float) -> Tensor:
+    """slope * exp((scores - total) / temperature), 0 where nothing is possible. total, slope: (B,)."""
+    shape = (-1, *[1] * (log_scores.dim() - 1))
+    possible = torch.where(total > -torch.inf, total, torch.zeros_like(total)).view(shape)
+    return slope.view(shape) * torch.exp((log_scores - possible) / temperature)
 
 
 def chain_beliefs(log_unary: Tensor, log_pairwise: Tensor, mask: Tensor, temperature: float = 0.0) -> Tensor:
@@ -70,7 +116,11 @@ def chain_beliefs(log_unary: Tensor, log_pairwise: Tensor, mask: Tensor, tempera
     """
     log_unary, log_pairwise = silence_padding(log_unary, log_pairwise, mask)
     forward, backward = chain_messages(log_unary, log_pairwise, temperature)
-    beliefs = log_unary + forward + backward
+    return normalise_beliefs(log_unary + forward + backward, temperature)
+
+
+def normalise_beliefs(beliefs: Tensor, temperature: float) -> Tensor:
+    """`log_softmax` over the last axis, of beliefs in units of the temperature; impossible everywhere stays so."""
     possible = beliefs.amax(-1, keepdim=True) > -torch.inf
     beliefs = torch.log_softmax(torch.where(possible, beliefs if temperature == 0 else beliefs / temperature, 0.0), dim=-1)
     return torch.where(possible, beliefs, -torch.inf)

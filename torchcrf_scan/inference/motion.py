@@ -13,6 +13,7 @@ from torchcrf_scan.geometry.kabsch import kabsch, safe_atan2
 from torchcrf_scan.inference.registration import gauss_newton_step
 
 ALONG = 0.03  # share of a residual along the surface that a point-to-line step still feels
+KEPT_SHARE, TRIM_ROUNDS = 0.8, 3  # of trimmed Kabsch
 PATIENCE = 2  # rounds for which an empty cluster keeps its motion before it is removed
 
 
@@ -131,6 +132,23 @@ def estimate(source: Tensor, support: Support, previous: Motions, *, metric: str
     value = torch.where(large[..., None], fitted, torch.where((support.count > 0)[..., None], small_fit, previous.value))
     value = torch.cat([background, value[:, 1:]], dim=1)
     return replace(previous, value=torch.where(previous.active[..., None], value, previous.value))
+
+
+def trim(source: Tensor, support: Support) -> Support:
+    """Keeps the best four fifths of every cluster's points under their own fit, three rounds (trimmed Kabsch, spec 7.3, 9.2).
+
+    source: (B, N, 2).
+    """
+    points = source[:, None].expand(-1, support.weights.shape[1], -1, -1)  # (B, C, N, 2)
+    partner = support.partner[:, None].expand_as(points)
+    real = support.weights > 0
+    most = (KEPT_SHARE * real.sum(-1, keepdim=True)).ceil().long().clamp(min=1) - 1  # (B, C, 1)
+    weights = support.weights
+    for _ in range(TRIM_ROUNDS):
+        moved = se2.apply(kabsch(points, partner, weights), points)
+        residual = torch.linalg.vector_norm(moved - partner, dim=-1).masked_fill(~real, torch.inf)
+        weights = support.weights * (residual <= residual.sort(-1).values.gather(-1, most))
+    return replace(support, weights=weights)
 
 
 def retire_empty(motions: Motions, count: Tensor) -> Motions:

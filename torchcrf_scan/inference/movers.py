@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise, residual_units
-from torchcrf_scan.inference.hypothesis_features import EXPLAINED, FEATURES, Landing, hypothesis_features, share_in_common
+from torchcrf_scan.inference.hypotheses import Hypotheses, residual_units
+from torchcrf_scan.inference.hypothesis_features import EXPLAINED, FEATURES, Landing, share_in_common
 from torchcrf_scan.inference.surface import Surface
 
 AS_WELL = 0.5  # units; a motion that fits this much worse at most explains the points as well
@@ -144,9 +144,7 @@ def _rivals(pool: Hypotheses, source: Surface, target: Surface) -> Tensor:
 
 
 def find_movers(
-    source: Surface, target: Surface, background: Tensor, dt: float, score: HypothesisScore, *, most: int = 6
+    hypotheses: Hypotheses, features: Tensor, source: Surface, target: Surface, score: HypothesisScore, *, most: int = 6
 ) -> Movers:
-    """The moving objects that the background motion (3,) leaves to be explained; dt: seconds between the scans."""
-    hypotheses = hypothesise(source, target, background, dt)
-    probabilities = score(hypothesis_features(hypotheses, source, target, background))
-    return select(hypotheses, probabilities, source, target, threshold=float(score.threshold), most=most)
+    """The hypotheses that the score accepts. features: (H, F) of `hypothesis_features`; most: movers at most."""
+    return select(hypotheses, score(features), source, target, threshold=float(score.threshold), most=most)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from torchcrf_scan.config import InferenceConfig, ModelConfig
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
 from torchcrf_scan.inference import joint
+from torchcrf_scan.inference.cold import ransac_motions
 from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.joint import Parameters
 
@@ -18,16 +22,52 @@ INDEX_GAP = 3
 SPATIAL_GAP = 0.75  # metres, as the two below: the paper's car and scanner
 EXPLAINED = 0.3
 FEWEST = 4
+ROUNDS = 3
+COLD_CANDIDATES = 32
 
 
 @torch.no_grad()
 def paper_start(view: PairView, found: Start, parameters: Parameters, config: InferenceConfig) -> Start:
-    """CRF-Matching's motion as background, and up to `clusters` - 2 movers from the runs of its residuals."""
-    batch = view.batch
+    """CRF-Matching's motion as background, and up to C - 1 movers from the runs of its residuals.
+
+    Args:
+        found: any start of C clusters; its association and tangents are where the search begins, its motions are not looked at.
+    """
     clusters = found.motions.shape[1]
-    begin = Start(batch.initial_motion[:, None], found.active[:, :1], found.association, found.target_tangents)
-    matched = joint.decode(view, begin, parameters, ModelConfig(chains="matching", inference=config))
-    return movers_from_associations(view, matched.motions[:, 0], matched.association, parameters, clusters, found.target_tangents)
+    background, association = match_cold(view, found, parameters, config)
+    return movers_from_associations(view, background, association, parameters, clusters, found.target_tangents)
+
+
+def match_cold(view: PairView, found: Start, parameters: Parameters, config: InferenceConfig) -> tuple[Tensor, Tensor]:
+    """Step 1 of spec 7.3: the association chain from standstill (or odometry), and one motion that most of it agrees with.
+
+    Nothing is known of the motion at first, so the candidates are those that look alike (design finding 5).
+
+    Returns:
+        (B, 3) motion of the background and (B, N) associations.
+    """
+    batch = view.batch
+    nothing = torch.full_like(found.association, -1)
+    start = Start(batch.initial_motion[:, None], found.active[:, :1], nothing, found.target_tangents)
+    search = replace(config, candidate_search="shape", candidates=config.candidates and max(config.candidates, COLD_CANDIDATES))
+    for _ in range(ROUNDS):
+        association = joint.associate(view, start, torch.zeros_like(nothing), parameters, search)
+        start = replace(start, motions=agreed_motion(batch, start.motions, association))
+        search = config
+    return start.motions[:, 0], association
+
+
+def agreed_motion(batch: ScanPairBatch, before: Tensor, association: Tensor) -> Tensor:
+    """(B, 1, 3) the two-point motion that most associations agree with, and Kabsch on those; `before` where there is none."""
+    motions = before.clone()
+    for b in range(len(batch)):
+        index = (association[b] >= 0).nonzero()[:, 0]
+        source, partner = batch.source[b, index], batch.target[b, association[b, index]]
+        best = ransac_motions(source, partner, source.new_tensor(EXPLAINED), 1)
+        if len(best):
+            agree = torch.linalg.vector_norm(se2.apply(best[0], source) - partner, dim=-1) < EXPLAINED
+            motions[b, 0] = kabsch(source, partner, agree.to(source))
+    return motions
 
 
 @torch.no_grad()

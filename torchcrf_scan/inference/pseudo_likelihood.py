@@ -8,12 +8,13 @@ A conditional logit over them is the objective, convex in the weights; learning 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
-from torchcrf_scan.config import ModelConfig
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features import candidates as candidate_search
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.association import pairwise_features
@@ -22,6 +23,7 @@ from torchcrf_scan.features.potentials import (
     Boosters,
     PairView,
     association_unary,
+    find_candidates,
     possible_clusters,
     registered_points,
     state_mask,
@@ -80,7 +82,11 @@ class Chain:
     Attributes:
         unary: (B, N, S, U), pairwise: (B, N-1, S, S, P) features; their weights are U + P.
         mask: (B, N, S) possible states. label: (B, N) true state. known: (B, N) nodes that count; the others cut the chain.
+        axes, labels: the tensors' axes after B (n nodes, e edges, s states), and which states a label counts; for stacking.
     """
+
+    axes: ClassVar[dict[str, str]] = {"unary": "ns", "pairwise": "ess", "mask": "ns", "label": "n", "known": "n"}
+    labels: ClassVar[dict[str, str]] = {"label": "s"}
 
     unary: Tensor
     pairwise: Tensor
@@ -128,11 +134,11 @@ def _truth_of(batch: ScanPairBatch) -> Truth:
     return batch.truth
 
 
-def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, count: int) -> Chain:
-    """The association chain's 14 + 4 features; states are `count` candidates and the truth, or every target (0)."""
+def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> Chain:
+    """The association chain's 14 + 4 features; states are the candidates of the decoding and the truth."""
     batch = view.batch
     truth = _truth_of(batch)
-    found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, count)
+    found = find_candidates(view, plugins.motions, plugins.active, config)
     index, mask, label = candidate_search.with_targets(found.index, found.mask, truth.association)
     states = AssociationStates.of(view, index, mask, scales, boosters)
     C = plugins.motions.shape[1]
@@ -144,9 +150,9 @@ def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters
     return Chain(unary, pairwise, state_mask(mask), label, known)
 
 
-def association_design(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, count: int) -> Design:
+def association_design(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> Design:
     """The association chain's 18 features of every state at the true labels of its neighbours."""
-    return association_chain(view, plugins, scales, boosters, count).design()
+    return association_chain(view, plugins, scales, boosters, config).design()
 
 
 def clustering_chain(view: PairView, plugins: PlugIns, scales: Scales) -> Chain:
@@ -176,21 +182,26 @@ def at_true_neighbours(pairwise: Tensor, label: Tensor, known: Tensor) -> Tensor
     Returns:
         (B, N, S, P).
     """
+    before, after = beside_true_neighbours(pairwise, label, known)
+    return before + after
+
+
+def beside_true_neighbours(pairwise: Tensor, label: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+    """The two terms of `at_true_neighbours`: the edge to the node before and the edge to the node after."""
     B, E, S, _, P = pairwise.shape
     row = label[:, :-1, None, None, None].expand(B, E, 1, S, P)
     column = label[:, 1:, None, None, None].expand(B, E, S, 1, P)
     from_before = pairwise.gather(2, row)[:, :, 0] * known[:, :-1, None, None]  # (B, E, S, P) for node i + 1
     from_after = pairwise.gather(3, column)[:, :, :, 0] * known[:, 1:, None, None]  # for node i
     none = pairwise.new_zeros(B, 1, S, P)
-    return torch.cat([none, from_before], dim=1) + torch.cat([from_after, none], dim=1)
+    return torch.cat([none, from_before], dim=1), torch.cat([from_after, none], dim=1)
 
 
 def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Parameters, config: ModelConfig) -> Tensor:
     """(B,) sum over nodes and chains (one chain alone where the model has one)."""
     total = view.batch.source.new_zeros(len(view.batch))
     if config.chains != "clustering":
-        count = config.inference.candidates
-        design = association_design(view, plugins, parameters.scales, parameters.boosters, count)
+        design = association_design(view, plugins, parameters.scales, parameters.boosters, config.inference)
         total = total + design.log_likelihood(parameters.association).sum(-1)
     if config.chains != "matching":
         total = total + clustering_design(view, plugins, parameters.scales).log_likelihood(parameters.clustering).sum(-1)

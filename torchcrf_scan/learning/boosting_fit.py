@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features import association
-from torchcrf_scan.features import candidates as candidate_search
 from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.features.candidates import squared_distances
-from torchcrf_scan.features.potentials import OUTLIER_INPUTS, AssociationStates, Boosters, PairView
+from torchcrf_scan.features.potentials import OUTLIER_INPUTS, AssociationStates, Boosters, PairView, find_candidates
 from torchcrf_scan.features.scales import LOCAL_CHANNELS, STATIC_CHANNELS, Scales
 from torchcrf_scan.inference.pseudo_likelihood import PlugIns
 from torchcrf_scan.learning.scales_fit import own_motion
@@ -113,12 +113,12 @@ def sample_targets(
 
 
 def outlier_examples(
-    view: PairView, plugins: PlugIns, scales: Scales, data_booster: StumpEnsemble, count: int
+    view: PairView, plugins: PlugIns, scales: Scales, data_booster: StumpEnsemble, inference: InferenceConfig
 ) -> tuple[Tensor, Tensor]:
-    """Source points: (P, 14) inputs reduced over the `count` candidates (0: all), and (P,) whether the truth is an outlier."""
+    """Source points: (P, 14) inputs reduced over the candidates of the decoding, and (P,) whether the truth is an outlier."""
     batch = view.batch
     assert batch.truth is not None
-    found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, count)
+    found = find_candidates(view, plugins.motions, plugins.active, inference)
     boosters = Boosters(data_booster.thresholds.shape[1])
     boosters.data = data_booster
     states = AssociationStates.of(view, found.index, found.mask, scales, boosters)
@@ -137,22 +137,35 @@ def fit_boosters(
     *,
     stumps: int,
     negatives: int,
-    candidates: int,
+    inference: InferenceConfig,
+    most: int,
+    hidden: Sequence[int],
     generator: torch.Generator,
 ) -> Boosters:
-    """Data booster, then the outlier booster on its margins."""
+    """Data booster, then the outlier booster on its margins.
+
+    Args:
+        most: examples of each at most, 0: all.
+        hidden: local channels that neither may look at.
+    """
     boosters = Boosters(stumps)
-    boosters.data = fit_stumps(
-        *_stack([data_examples(v, p, scales, negatives, generator) for v, p in zip(views, plugins, strict=True)]), stumps
-    )
-    boosters.outlier = fit_stumps(
-        *_stack([outlier_examples(v, p, scales, boosters.data, candidates) for v, p in zip(views, plugins, strict=True)]), stumps
-    )
+    both = list(zip(views, plugins, strict=True))
+    pairs = [data_examples(view, plugin, scales, negatives, generator) for view, plugin in both]
+    boosters.data = fit_stumps(*_stack(pairs, most, hidden, generator), stumps)
+    points = [outlier_examples(view, plugin, scales, boosters.data, inference) for view, plugin in both]
+    boosters.outlier = fit_stumps(*_stack(points, most, hidden, generator), stumps)
     assert len(boosters.data.thresholds) == len(LOCAL_CHANNELS)
     assert len(boosters.outlier.thresholds) == OUTLIER_INPUTS
     return boosters
 
 
-def _stack(parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[np.ndarray, np.ndarray]:
-    inputs = torch.cat([part[0] for part in parts]).float().cpu().numpy()
-    return inputs, torch.cat([part[1] for part in parts]).cpu().numpy()
+def _stack(
+    parts: Sequence[tuple[Tensor, Tensor]], most: int, hidden: Sequence[int], generator: torch.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs and classes of all parts, thinned at random to `most` (0: not); no tree splits a hidden channel, which is constant."""
+    inputs, positive = torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
+    if 0 < most < len(inputs):
+        kept = torch.randperm(len(inputs), generator=generator)[:most].to(inputs.device)
+        inputs, positive = inputs[kept], positive[kept]
+    inputs[:, list(hidden)] = 0.0
+    return inputs.float().cpu().numpy(), positive.cpu().numpy()

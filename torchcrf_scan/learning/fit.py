@@ -12,30 +12,21 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import LearningConfig
 from torchcrf_scan.features.potentials import Boosters, PairView
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS, live_weights
 from torchcrf_scan.inference import joint, pseudo_likelihood
 from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.motion import Motions
+from torchcrf_scan.inference.lattice_likelihood import lattice_chain
 from torchcrf_scan.inference.pseudo_likelihood import Chain, PlugIns
 from torchcrf_scan.learning.boosting_fit import fit_boosters
-from torchcrf_scan.learning.disturb import disturb
+from torchcrf_scan.learning.material import Material
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.scales_fit import fit_scales
 from torchcrf_scan.learning.weights_fit import Watch, fit_chain
 from torchcrf_scan.model import JointScanCRF
-from torchcrf_scan.scan import ScanPair
 
-
-@dataclass(frozen=True, slots=True)
-class Material:
-    """A batch of annotated pairs with its start; `fold` is its part of the out-of-fold margins."""
-
-    batch: ScanPairBatch
-    start: Start
-    fold: int
+Margins = dict[int, Boosters]  # by out-of-fold part, boosters that have not seen it
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,51 +39,72 @@ class Lesson:
     fold: int
 
 
-def gather_material(model: JointScanCRF, pairs: Sequence[ScanPair], config: LearningConfig) -> list[Material]:
-    """Batches of one fold each, with the start that `model` finds; several models may learn from them.
-
-    Raises:
-        ValueError: a pair without annotation, or no pair.
-    """
-    bare = [pair.name for pair in pairs if pair.annotation is None]
-    if bare or not pairs:
-        raise ValueError(f"pairs: expected annotated pairs, got {bare[:3] or 'none'}")
-    folds = assign_folds(pairs, config.folds)
-    parts = {fold: [pair for pair, of in zip(pairs, folds, strict=True) if of == fold] for fold in sorted(set(folds))}
-    step = config.batch_size
-    batches = [(fold, part[k : k + step]) for fold, part in parts.items() for k in range(0, len(part), step)]
-    material = []
-    generator = torch.Generator().manual_seed(config.seed)
-    for fold, part in tqdm(batches, desc="InitialiseRT", unit="batch", leave=False):
-        batch = ScanPairBatch.collate(part)
-        if config.disturbance > 0:
-            batch = disturb(batch, config.disturbance, generator)
-        material.append(Material(batch, model.initialise(batch), fold))
-    return material
-
-
-def fit(model: JointScanCRF, material: Sequence[Material], config: LearningConfig, watch: dict[str, Watch] | None = None) -> None:
+def fit(
+    model: JointScanCRF,
+    material: Sequence[Material],
+    config: LearningConfig,
+    watch: dict[str, Watch] | None = None,
+    *,
+    features_of: tuple[JointScanCRF, Margins] | None = None,
+) -> Margins:
     """Fits scales, boosters and weights of `model`, in place.
 
     Args:
-        watch: callbacks of the two weight fits, by chain: `association`, `clustering`.
+        watch: callbacks of the weight fits, by chain: `association`, `clustering`; or of the one fit, `lattice`.
+        features_of: a model with both chains that was fitted on the same material, and what its fit returned: scales and boosters
+            are then taken from there.
+
+    Returns:
+        By fold, boosters that have not seen it; none for the clustering chain alone.
     """
     watch = watch or {}
     generator = torch.Generator().manual_seed(config.seed)
     chains = model.config.chains
     lessons = [prepare(model, part, config, generator) for part in material]
-    views, plugins = [lesson.view for lesson in lessons], [lesson.plugins for lesson in lessons]
-    model.scales.load_state_dict(fit_scales(views, plugins).state_dict())
+    margins = fit_features(model, lessons, config, generator, features_of)
+    if model.config.coupling == "lattice":
+        fit_lattice(model, lessons, margins, config, watch.get("lattice"))
+        return margins
+    live = live_weights(model.config.features)
     predicted = [lesson.start.association for lesson in lessons]
     if chains != "clustering":
-        margins = fit_all_boosters(model, lessons, config, generator)
         features = [association_chain(model, lesson, margins[lesson.fold]) for lesson in lessons]
-        set_weights(model, "association", fit_chain(features, live_weights(model), config, watch.get("association")))
+        set_weights(model, "association", fit_chain(features, live[0], config, watch.get("association")))
         predicted = [predict_association(model, lesson, margins[lesson.fold]) for lesson in lessons]
     if chains != "matching":
-        features = [clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True)]
-        live = torch.ones(len(CLUSTERING_WEIGHTS), dtype=torch.float64)
-        set_weights(model, "clustering", fit_chain(features, live, config, watch.get("clustering")))
+        chain = [clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True)]
+        set_weights(model, "clustering", fit_chain(chain, live[1], config, watch.get("clustering")))
+    return margins
+
+
+def fit_features(
+    model: JointScanCRF,
+    lessons: Sequence[Lesson],
+    config: LearningConfig,
+    generator: torch.Generator,
+    features_of: tuple[JointScanCRF, Margins] | None,
+) -> Margins:
+    """Scales and boosters, fitted or taken over."""
+    if features_of is not None:
+        other, margins = features_of
+        model.scales.load_state_dict(other.scales.state_dict())
+        model.boosters.load_state_dict(other.boosters.state_dict())
+        return margins
+    fitted = fit_scales([lesson.view for lesson in lessons], [lesson.plugins for lesson in lessons])
+    model.scales.load_state_dict(fitted.state_dict())
+    return {} if model.config.chains == "clustering" else fit_all_boosters(model, lessons, config, generator)
+
+
+def fit_lattice(
+    model: JointScanCRF, lessons: Sequence[Lesson], margins: Margins, config: LearningConfig, watch: Watch | None
+) -> None:
+    """All 30 weights at once; no association is plugged in, so `config.predicted_share` says nothing."""
+    inference = model.config.inference
+    features = [lattice_chain(of.view, of.plugins, model.scales, margins[of.fold], inference) for of in lessons]
+    live = torch.cat(live_weights(model.config.features))
+    association, clustering = fit_chain(features, live, config, watch).split([len(ASSOCIATION_WEIGHTS), len(CLUSTERING_WEIGHTS)])
+    set_weights(model, "association", association)
+    set_weights(model, "clustering", clustering)
 
 
 def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generator: torch.Generator) -> Lesson:
@@ -105,22 +117,7 @@ def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generat
     return Lesson(view, start, plugins, part.fold)
 
 
-def assign_folds(pairs: Sequence[ScanPair], folds: int) -> list[int]:
-    """A fold for every pair; sequences stay whole and are dealt out in turn by size. One fold where there is nothing to deal."""
-    sizes: dict[str, int] = {}
-    for pair in pairs:
-        sizes[pair.sequence] = sizes.get(pair.sequence, 0) + 1
-    load = [0] * max(1, min(folds, len(sizes)))
-    fold_of = {}
-    for sequence in sorted(sizes, key=lambda name: (-sizes[name], name)):
-        fold_of[sequence] = load.index(min(load))
-        load[fold_of[sequence]] += sizes[sequence]
-    return [fold_of[pair.sequence] for pair in pairs]
-
-
-def fit_all_boosters(
-    model: JointScanCRF, lessons: Sequence[Lesson], config: LearningConfig, generator: torch.Generator
-) -> dict[int, Boosters]:
+def fit_all_boosters(model: JointScanCRF, lessons: Sequence[Lesson], config: LearningConfig, generator: torch.Generator) -> Margins:
     """Fits the model's boosters on all pairs; returns by fold those of the other folds (margins of unseen pairs, spec 2.5)."""
 
     def fit_on(part: Sequence[Lesson]) -> Boosters:
@@ -130,7 +127,9 @@ def fit_all_boosters(
             model.scales,
             stumps=model.config.features.stumps,
             negatives=config.negatives,
-            candidates=model.config.inference.candidates,
+            inference=model.config.inference,
+            most=config.booster_examples,
+            hidden=[k for k, name in enumerate(LOCAL_CHANNELS) if f"association.{name}" in model.config.features.left_out],
             generator=generator,
         )
 
@@ -145,21 +144,15 @@ def fit_all_boosters(
 
 def association_chain(model: JointScanCRF, lesson: Lesson, margins: Boosters) -> Chain:
     """The lesson's association features with margins of boosters that have not seen it."""
-    count = model.config.inference.candidates
-    return pseudo_likelihood.association_chain(lesson.view, lesson.plugins, model.scales, margins, count)
+    return pseudo_likelihood.association_chain(lesson.view, lesson.plugins, model.scales, margins, model.config.inference)
 
 
+@torch.no_grad()
 def predict_association(model: JointScanCRF, lesson: Lesson, margins: Boosters) -> Tensor:
     """(B, N) labels of one exact pass over the association chain at the training motions."""
-    parameters = replace(model.fitted, boosters=margins)
-    plugins, config = lesson.plugins, model.config.inference
-    with torch.no_grad():
-        start = replace(lesson.start, motions=plugins.motions, active=plugins.active, reach=None)
-        state = joint.first_state(lesson.view, start, parameters, config)
-        one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), plugins.motions.shape[1] + 1).to(plugins.motions)
-        state = replace(state, motions=Motions.start(plugins.motions, plugins.active), log_cluster=one_hot)
-        found = joint.find_candidates(lesson.view, plugins.motions, plugins.active, config)
-        return joint.update_association(lesson.view, state, found, parameters, config).association
+    parameters, plugins = replace(model.fitted, boosters=margins), lesson.plugins
+    start = replace(lesson.start, motions=plugins.motions, active=plugins.active, reach=None)
+    return joint.associate(lesson.view, start, plugins.cluster, parameters, model.config.inference)
 
 
 def clustering_chain(
@@ -169,14 +162,6 @@ def clustering_chain(
     share = config.predicted_share if model.config.chains == "joint" else 1.0
     plugins = mix_associations(lesson.plugins, predicted, share, generator)
     return pseudo_likelihood.clustering_chain(lesson.view, plugins, model.scales)
-
-
-def live_weights(model: JointScanCRF) -> Tensor:
-    """(18,) 1 for the association weights that are learned; 0 for the raw channels in W-B."""
-    live = torch.ones(len(ASSOCIATION_WEIGHTS), dtype=torch.float64)
-    if not model.config.features.raw_channels:
-        live[: len(LOCAL_CHANNELS)] = 0
-    return live
 
 
 @torch.no_grad()

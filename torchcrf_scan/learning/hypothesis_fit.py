@@ -34,6 +34,7 @@ KEPT_BEAMS = (0.5, 1.0)
 PURE = 0.7  # share of a mover's points in the members of a hypothesis that is taken as its
 TOLERANCE, TOLERANCE_SHARE = 1.0, 0.12  # units and share of the displacement up to which a motion is right
 THRESHOLDS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)
+VIEWS = 3  # of every pair
 REGULARISATION = 0.03  # inverse; looser weights fit the simulator, not the world
 MODEL_CAR = SimulatorConfig(scale=0.1, fov=360.0, beams=360, range_max=9.0, dropout=0.3, dt=0.24)
 MIXTURE = (  # share and world
@@ -48,7 +49,7 @@ MIXTURE = (  # share and world
 
 
 @dataclass(frozen=True, slots=True)
-class _View:
+class HypothesisView:
     """One pair as the fit sees it: its surfaces, a background, the hypotheses, their features (H, F) and labels.
 
     Attributes:
@@ -74,21 +75,18 @@ def simulate_mixture(count: int, seed: int) -> list[ScanPair]:
     return pairs
 
 
-def fit_hypothesis_score(pairs: Sequence[ScanPair], *, views: int = 3, seed: int = 0) -> HypothesisScore:
-    """Fits weights and threshold on annotated pairs, each seen `views` times with other noise, beams and background error.
+def view_pair(pair: ScanPair, seed: int, views: int = VIEWS) -> list[HypothesisView]:
+    """The annotated pair seen `views` times with other noise, beams and background error. Takes about 0.15 s a view."""
+    generator = torch.Generator().manual_seed(seed)
+    return [view for _ in range(views) if (view := _view(pair, generator)) is not None]
 
-    Takes about 0.15 s a pair and view.
+
+def fit_hypothesis_score(seen: Sequence[HypothesisView]) -> HypothesisScore:
+    """Fits weights and threshold.
 
     Returns:
         The fitted score, or the default one where the pairs hold no mover, or nothing else.
-
-    Raises:
-        ValueError: a pair without annotation.
     """
-    if any(pair.annotation is None for pair in pairs):
-        raise ValueError("pairs: expected annotated pairs, got some without annotation")
-    generator = torch.Generator().manual_seed(seed)
-    seen = [view for pair in pairs for _ in range(views) if (view := _view(pair, generator)) is not None]
     features = torch.cat([view.features for view in seen]) if seen else torch.zeros(0, len(FEATURES))
     label = torch.cat([view.label for view in seen]) if seen else torch.zeros(0)
     if not ((label == 0).any() and (label == 1).any()):
@@ -112,7 +110,7 @@ def fit_logistic(features: Tensor, label: Tensor) -> HypothesisScore:
     return score
 
 
-def _view(pair: ScanPair, generator: torch.Generator) -> _View | None:
+def _view(pair: ScanPair, generator: torch.Generator) -> HypothesisView | None:
     """The pair disturbed as real recordings are; None where a scan is left without points."""
     assert pair.annotation is not None
     batch = ScanPairBatch.collate([pair])
@@ -132,7 +130,7 @@ def _view(pair: ScanPair, generator: torch.Generator) -> _View | None:
     hypotheses = hypothesise(source, target, background, pair.dt)
     features = hypothesis_features(hypotheses, source, target, background)
     label = label_hypotheses(hypotheses, source, body, motions, unit)
-    return _View(source, target, hypotheses, features, label, body, motions)
+    return HypothesisView(source, target, hypotheses, features, label, body, motions)
 
 
 def _thin(count: int, generator: torch.Generator) -> Tensor:
@@ -178,14 +176,14 @@ def _apart(one: Tensor, other: Tensor, points: Tensor, members: Tensor) -> Tenso
     return (gap * members).sum(-1) / members.sum(-1)
 
 
-def _best_threshold(score: HypothesisScore, views: Sequence[_View]) -> float:
+def _best_threshold(score: HypothesisScore, views: Sequence[HypothesisView]) -> float:
     """The probability at which accepted movers have the best F1 score."""
     results = np.array([_count_accepted(score, view) for view in views]).sum(0)  # (T, 3)
     right, accepted, true = results.T
     return THRESHOLDS[int((2 * right / np.maximum(accepted + true, 1)).argmax())]
 
 
-def _count_accepted(score: HypothesisScore, view: _View) -> list[tuple[int, int, int]]:
+def _count_accepted(score: HypothesisScore, view: HypothesisView) -> list[tuple[int, int, int]]:
     """For every threshold: right acceptances (each mover once), acceptances, and movers that some hypothesis got right.
 
     The choice is greedy, so a higher threshold accepts the first of those that a lower one accepts.
@@ -203,5 +201,5 @@ def _count_accepted(score: HypothesisScore, view: _View) -> list[tuple[int, int,
     return rows
 
 
-def _bodies(view: _View, members: Tensor) -> set[int]:
+def _bodies(view: HypothesisView, members: Tensor) -> set[int]:
     return {int(view.body[row].mode().values) for row in members}

@@ -16,18 +16,19 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
+from torchcrf_scan.batch import Prediction, ScanPairBatch
 from torchcrf_scan.config import WORLDS, Config, DataConfig
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.evaluation.metrics import PairScore, score_pair, summarise
+from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import Table, report
+from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.paper_start import movers_from_associations
-from torchcrf_scan.learning.fit import Material, fit, gather_material
-from torchcrf_scan.learning.hypothesis_fit import fit_hypothesis_score
+from torchcrf_scan.learning.cascade_fit import fit_cascade
+from torchcrf_scan.learning.fit import fit
+from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.learning.weights_fit import Watch
-from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
+from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import PairPrediction, ScanPair
 from torchcrf_scan.viz.tensorboard import RunLog
 
@@ -51,8 +52,11 @@ def train(config: Config) -> dict[str, list[PairScore]]:
     began = time.perf_counter()
     with RunLog(folder) as run:
         model = JointScanCRF(config.model)
-        model.hypothesis_score = fit_hypothesis_score(train_pairs, seed=config.learning.seed)
-        material = gather_material(model, train_pairs, config.learning)
+        collection = collect(train_pairs, config.learning)
+        everything = range(len(collection))
+        model.hypothesis_score = collection.fit_score(everything)
+        clusters = config.model.inference.clusters - 1
+        material = collection.material(everything, model.hypothesis_score, clusters, config.learning)
         decoders = fit_methods(model, material, config, run)
         model.save_pretrained(folder / "model")
         log.info("fitted in %.0f s", time.perf_counter() - began)
@@ -95,40 +99,14 @@ def fit_methods(model: JointScanCRF, material: list[Material], config: Config, r
     fit(model, material, config.learning, watches(run, "joint"))
     decoders: dict[str, Decoder] = {"joint": model}
     if config.compare_chains and config.model.chains == "joint":
-        matching = MatchingCRF(config.model)
-        fit(matching, material, config.learning, watches(run, "matching"))
-        clustering = ClusteringCRF(config.model)
-        cascade = Cascade(matching, clustering)
-        fed = [Material(part.batch, cascade.feed(part.batch, part.start), part.fold) for part in material]
-        fit(clustering, fed, config.learning, watches(run, "clustering"))
-        decoders["CRF-Matching"] = lambda batch, start: matching(batch, start.background_alone())
+        cascade = fit_cascade(material, config, {method: watches(run, method) for method in ("matching", "clustering")})
+        decoders["CRF-Matching"] = lambda batch, start: cascade.matching(batch, start.background_alone())
         decoders["CRF-Clustering"] = cascade
     return decoders
 
 
-class Cascade:
-    """CRF-Clustering on the associations of CRF-Matching, nothing fed back (spec 9.4)."""
-
-    def __init__(self, matching: MatchingCRF, clustering: ClusteringCRF) -> None:
-        self.matching, self.clustering = matching, clustering
-
-    @torch.no_grad()
-    def feed(self, batch: ScanPairBatch, start: Start) -> Start:
-        """CRF-Matching's associations, its motion as background, movers from the runs of its residuals."""
-        matched = self.matching(batch, start.background_alone())
-        clusters = self.clustering.config.inference.clusters - 1
-        view, fitted = self.clustering.view(batch), self.matching.fitted
-        background = scale_motions(matched.motions[:, 0], view.factor)
-        fed = movers_from_associations(view, background, matched.association, fitted, clusters, start.target_tangents)
-        return fed.scaled(1 / view.factor)
-
-    def __call__(self, batch: ScanPairBatch, start: Start) -> Prediction:
-        """Decodes a batch."""
-        return self.clustering(batch, self.feed(batch, start))
-
-
 def watches(run: RunLog, method: str) -> dict[str, Watch]:
-    """Callbacks that log both weight fits under the method's name."""
+    """Callbacks that log the weight fits under the method's name."""
 
     def watch(chain: str) -> Watch:
         def look(step: int, loss: float, slope: float, weights: Tensor) -> None:
@@ -136,7 +114,7 @@ def watches(run: RunLog, method: str) -> dict[str, Watch]:
 
         return look
 
-    return {chain: watch(chain) for chain in ("association", "clustering")}
+    return {chain: watch(chain) for chain in ("association", "clustering", "lattice")}
 
 
 @torch.no_grad()

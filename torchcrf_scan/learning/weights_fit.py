@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -10,8 +12,10 @@ from scipy.optimize import OptimizeResult, minimize
 from torch import Tensor
 
 from torchcrf_scan.config import LearningConfig
+from torchcrf_scan.inference.lattice_likelihood import LatticeChain
 from torchcrf_scan.inference.pseudo_likelihood import Chain, Design
 
+AnyChain = TypeVar("AnyChain", Chain, LatticeChain)
 Watch = Callable[[int, float, float, Tensor], None]
 
 
@@ -32,8 +36,8 @@ def flatten(designs: Sequence[Design]) -> Design:
     return Design(features, mask, label, torch.ones_like(label, dtype=torch.bool))
 
 
-def fit_chain(chains: Sequence[Chain], live: Tensor, config: LearningConfig, watch: Watch | None = None) -> Tensor:
-    """The weights of one chain, by `config.objective`: pseudo-likelihood, or from its optimum on by exact likelihood.
+def fit_chain(chains: Sequence[AnyChain], live: Tensor, config: LearningConfig, watch: Watch | None = None) -> Tensor:
+    """The weights of a chain or the lattice by `config.objective`: pseudo-likelihood, or from its optimum on exact likelihood.
 
     Args:
         live: (W,) 1 for the weights that are learned, 0 for those that stay 0.
@@ -57,34 +61,37 @@ def fit_chain(chains: Sequence[Chain], live: Tensor, config: LearningConfig, wat
     return fit_weights(design, config, look, live=live, start=weights, log_likelihood=lambda w: exact.log_likelihood(w).sum())
 
 
-def stack(chains: Sequence[Chain]) -> Chain:
-    """Many batches of chains as one, padded, float64 and without a gradient of their own; the outlier stays the last state."""
-    longest = max(chain.unary.shape[1] for chain in chains)
-    states = max(chain.unary.shape[2] for chain in chains)
+def stack(chains: Sequence[AnyChain]) -> AnyChain:
+    """Many batches of chains as one, padded, float64 and without a gradient of their own; outliers stay the last states."""
+    first = chains[0]
+    lengths: dict[str, int] = {}
+    for chain in chains:
+        for name, axes in first.axes.items():
+            for axis, length in zip(axes, getattr(chain, name).shape[1:], strict=False):
+                lengths[axis] = max(lengths.get(axis, 0), length)
+    own = {name: next(of for of, axes in first.axes.items() if axis in axes) for name, axis in first.labels.items()}
 
-    def spread(values: Tensor, dims: Sequence[int], length: int) -> Tensor:
-        """Puts spare states before the last one along `dims`, and spare nodes at the end."""
-        for dim in dims:
-            own = values.shape[dim] - 1
-            inliers, outlier = values.split([own, 1], dim)
-            shape = list(values.shape)
-            shape[dim] = states - own - 1
-            values = torch.cat([inliers, values.new_zeros(shape), outlier], dim)
-        shape = list(values.shape)
-        shape[1] = length - shape[1]
-        return torch.cat([values, values.new_zeros(shape)], dim=1)
+    def spread(chain: AnyChain, name: str) -> Tensor:
+        values = getattr(chain, name).detach()
+        if name in first.labels:
+            axis = first.labels[name]
+            outlier = getattr(chain, own[name]).shape[1 + first.axes[own[name]].index(axis)] - 1
+            values = torch.where(values == outlier, lengths[axis] - 1, values)
+        values = values.double() if values.is_floating_point() else values
+        for dim, axis in enumerate(first.axes[name], start=1):
+            values = _lengthen(values, dim, lengths[axis], is_states=axis not in "ne")
+        return values
 
-    def label(chain: Chain) -> Tensor:
-        own = chain.unary.shape[2] - 1
-        return spread(torch.where(chain.label == own, states - 1, chain.label), (), longest)
+    return replace(first, **{name: torch.cat([spread(chain, name) for chain in chains]) for name in first.axes})
 
-    return Chain(
-        unary=torch.cat([spread(chain.unary.detach().double(), (2,), longest) for chain in chains]),
-        pairwise=torch.cat([spread(chain.pairwise.detach().double(), (2, 3), longest - 1) for chain in chains]),
-        mask=torch.cat([spread(chain.mask, (2,), longest) for chain in chains]),
-        label=torch.cat([label(chain) for chain in chains]),
-        known=torch.cat([spread(chain.known, (), longest) for chain in chains]),
-    )
+
+def _lengthen(values: Tensor, dim: int, length: int, *, is_states: bool) -> Tensor:
+    """Puts zeros at the end of an axis, or before its last entry where that is the outlier state."""
+    last = values.shape[dim] - int(is_states)
+    shape = list(values.shape)
+    shape[dim] = length - values.shape[dim]
+    head, tail = values.split([last, values.shape[dim] - last], dim)
+    return torch.cat([head, values.new_zeros(shape), tail], dim)
 
 
 def fit_weights(

@@ -1,0 +1,35 @@
+"""Which weights a model has."""
+
+import itertools
+
+import pytest
+import torch
+
+from torchcrf_scan.config import FeatureConfig
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS, live_weights
+from torchcrf_scan.model import JointScanCRF, ModelConfig
+
+EVERY = [*(f"association.{name}" for name in ASSOCIATION_WEIGHTS), *(f"clustering.{name}" for name in CLUSTERING_WEIGHTS)]
+
+
+def dead(config: FeatureConfig) -> set[str]:
+    return {name for name, is_live in zip(EVERY, torch.cat(live_weights(config)).tolist(), strict=True) if not is_live}
+
+
+@pytest.mark.parametrize(
+    "left_out", [(), *itertools.combinations(EVERY[::4], 2), ("association.sequence",), ("clustering.sequence",)]
+)
+def test_what_is_left_out_is_dead_and_nothing_else(left_out: tuple[str, ...]) -> None:
+    raw = {f"association.{name}" for name in LOCAL_CHANNELS}
+    assert dead(FeatureConfig(left_out=left_out)) == set(left_out)
+    assert dead(FeatureConfig(left_out=left_out, raw_channels=False)) == set(left_out) | raw
+
+
+def test_the_model_has_no_dead_weight_whatever_its_parameters_say() -> None:
+    model = JointScanCRF(ModelConfig(features=FeatureConfig(left_out=("association.geo1", "clustering.outlier"))))
+    with torch.no_grad():
+        for weight in model.parameters():
+            weight.fill_(2.0)
+    association, clustering = model.weight_vectors
+    assert {name for name, value in zip(ASSOCIATION_WEIGHTS, association, strict=True) if value == 0} == {"geo1"}
+    assert {name for name, value in zip(CLUSTERING_WEIGHTS, clustering, strict=True) if value == 0} == {"outlier"}

@@ -1,0 +1,28 @@
+"""Fits the two chains apart: CRF-Matching, then CRF-Clustering on its associations of pairs that its boosters have not seen."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+
+from torchcrf_scan.baselines.cascade import Cascade
+from torchcrf_scan.config import Config
+from torchcrf_scan.learning.fit import fit
+from torchcrf_scan.learning.material import Material
+from torchcrf_scan.learning.weights_fit import Watch
+from torchcrf_scan.model import ClusteringCRF, MatchingCRF
+
+
+def fit_cascade(material: Sequence[Material], config: Config, watch: Mapping[str, dict[str, Watch]] | None = None) -> Cascade:
+    """The fitted cascade. watch: callbacks of the weight fits, of `matching` and of `clustering`, see `fit`."""
+    watch = watch or {}
+    matching, clustering = MatchingCRF(config.model), ClusteringCRF(config.model)
+    margins = fit(matching, material, config.learning, watch.get("matching"))
+    fed = []
+    for part in material:
+        unseen = copy.deepcopy(matching)
+        unseen.boosters = margins[part.fold]
+        start = Cascade(unseen, clustering).feed(part.batch, part.start)
+        fed.append(Material(part.batch, start, part.fold))
+    fit(clustering, fed, config.learning, watch.get("clustering"))
+    return Cascade(matching, clustering)

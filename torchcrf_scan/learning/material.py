@@ -1,0 +1,115 @@
+"""Annotated pairs as learning sees them: looked at once, then dealt out to as many folds and models as one likes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from joblib import Parallel, delayed
+from tqdm import tqdm
+
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.config import LearningConfig
+from torchcrf_scan.inference.initialise import Start, Survey, choose, survey
+from torchcrf_scan.inference.movers import HypothesisScore
+from torchcrf_scan.learning.disturb import disturb
+from torchcrf_scan.learning.hypothesis_fit import HypothesisView, fit_hypothesis_score, view_pair
+from torchcrf_scan.scan import ScanPair
+
+PART = 4  # pairs that one job looks at
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """A batch of annotated pairs with its start; `fold` is its part of the out-of-fold margins."""
+
+    batch: ScanPairBatch
+    start: Start
+    fold: int
+
+
+@dataclass(frozen=True, slots=True)
+class Collection:
+    """Annotated pairs with all that takes long to find and depends neither on other pairs nor on anything learned.
+
+    Attributes:
+        sequences: of every pair. names: of every pair.
+        batch: all P pairs, disturbed as moving sensors disturb them.
+        surveys: P what InitialiseRT looks at in the disturbed pairs.
+        views: P lists of what the movers' score is fitted on.
+    """
+
+    names: tuple[str, ...]
+    sequences: tuple[str, ...]
+    batch: ScanPairBatch
+    surveys: tuple[Survey | None, ...]
+    views: tuple[list[HypothesisView], ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def fit_score(self, index: Iterable[int]) -> HypothesisScore:
+        """The score of movers' hypotheses, fitted on some of the pairs."""
+        return fit_hypothesis_score([view for k in index for view in self.views[k]])
+
+    def material(self, index: Sequence[int], score: HypothesisScore, clusters: int, config: LearningConfig) -> list[Material]:
+        """Batches of some of the pairs, each of one out-of-fold part, with the start that the score gives.
+
+        clusters: C, background included.
+        """
+        folds = assign_folds([self.sequences[k] for k in index], config.folds)
+        material = []
+        for fold in sorted(set(folds)):
+            part = [k for k, of in zip(index, folds, strict=True) if of == fold]
+            for begin in range(0, len(part), config.batch_size):
+                rows = part[begin : begin + config.batch_size]
+                batch = self.batch.select(torch.tensor(rows))
+                material.append(Material(batch, choose(batch, [self.surveys[k] for k in rows], score, clusters), fold))
+        return material
+
+
+def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) -> Collection:
+    """Looks at the pairs, on `jobs` cores; what is drawn at random for a pair does not depend on `jobs`.
+
+    Raises:
+        ValueError: a pair without annotation, or no pair.
+    """
+    bare = [pair.name for pair in pairs if pair.annotation is None]
+    if bare or not pairs:
+        raise ValueError(f"pairs: expected annotated pairs, got {bare[:3] or 'none'}")
+    batch = ScanPairBatch.collate(pairs)
+    if config.disturbance > 0:
+        batch = disturb(batch, config.disturbance, torch.Generator().manual_seed(config.seed))
+    parts = [range(k, min(k + PART, len(pairs))) for k in range(0, len(pairs), PART)]
+    tasks = (
+        delayed(_look)(batch.select(torch.tensor(part)), [pairs[k] for k in part], [config.seed + k for k in part])
+        for part in parts
+    )
+    found = Parallel(n_jobs=jobs, return_as="generator")(tasks)
+    surveys: list[Survey | None] = []
+    views: list[list[HypothesisView]] = []
+    for of_surveys, of_views in tqdm(found, total=len(parts), desc="InitialiseRT", unit="batch", leave=False):
+        surveys += of_surveys
+        views += of_views
+    names, sequences = tuple(pair.name for pair in pairs), tuple(pair.sequence for pair in pairs)
+    return Collection(names, sequences, batch, tuple(surveys), tuple(views))
+
+
+def _look(
+    batch: ScanPairBatch, pairs: Sequence[ScanPair], seeds: Sequence[int]
+) -> tuple[list[Survey | None], list[list[HypothesisView]]]:
+    return survey(batch), [view_pair(pair, seed) for pair, seed in zip(pairs, seeds, strict=True)]
+
+
+def assign_folds(sequences: Sequence[str], folds: int) -> list[int]:
+    """A fold for every pair, given its sequence; sequences stay whole and are dealt out by size, one fold where there is one."""
+    sizes: dict[str, int] = {}
+    for sequence in sequences:
+        sizes[sequence] = sizes.get(sequence, 0) + 1
+    load = [0] * max(1, min(folds, len(sizes)))
+    fold_of = {}
+    for sequence in sorted(sizes, key=lambda name: (-sizes[name], name)):
+        fold_of[sequence] = load.index(min(load))
+        load[fold_of[sequence]] += sizes[sequence]
+    return [fold_of[sequence] for sequence in sequences]
