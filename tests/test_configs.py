@@ -1,12 +1,14 @@
 """Every file in configs/ is read by the parser that train.py builds, and says what it means to."""
 
 from argparse import ArgumentError
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from jsonargparse import ArgumentParser
 
-from torchcrf_scan.config import Config, FeatureConfig, InferenceConfig, LearningConfig
+from torchcrf_scan.commands.experiment import read_variants
+from torchcrf_scan.config import WEIGHTS, Config, ExperimentConfig, FeatureConfig, InferenceConfig, LearningConfig, ModelConfig
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 FILES = sorted(path.name for path in CONFIGS.glob("*.yaml"))
@@ -46,7 +48,7 @@ def test_the_paper_is_the_paper() -> None:
     assert config.model.inference.clusters == 5
     assert config.model.inference.motion_weights == "hard"
     assert config.model.inference.motion_metric == "point"
-    assert config.model.start == "paper"
+    assert config.model.start == "search"  # the paper does not say; `paper` is one reading of it
     assert not config.model.features.wrap_closed
     assert config.model.features.stumps == 50
     assert config.learning.negatives == 10
@@ -79,3 +81,78 @@ def test_a_file_with_an_unknown_key_is_refused(tmp_path: Path) -> None:
     path.write_text("model:\n  inference:\n    speed: 3\n")
     with pytest.raises(ArgumentError, match="speed"):
         parse(f"--config={path}")
+
+
+# --- ablations ----------------------------------------------------------------------------------------------------------------
+
+ABLATIONS = CONFIGS / "ablations"
+
+
+@pytest.fixture(scope="module")
+def variants() -> dict[str, Config]:
+    return read_variants(ABLATIONS, load("paper.yaml"))
+
+
+@pytest.mark.parametrize("path", sorted(ABLATIONS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_an_ablation_has_a_reason_and_changes_the_paper(path: Path, variants: dict[str, Config]) -> None:
+    assert path.read_text().startswith("# ")
+    paper = load("paper.yaml")
+    if path.stem == "without_a_feature":
+        assert path.stem not in variants
+    else:
+        assert variants[path.stem] != paper
+        assert (variants[path.stem].data, variants[path.stem].output) == (paper.data, paper.output)  # the same pairs
+
+
+def test_no_two_ablations_are_the_same(variants: dict[str, Config]) -> None:
+    assert len({str(config) for config in variants.values()}) == len(variants) > 40
+
+
+def test_every_feature_is_left_out_in_turn(variants: dict[str, Config]) -> None:
+    paper = load("paper.yaml")
+    without = {name.removeprefix("without "): config for name, config in variants.items() if name.startswith("without ")}
+    for name, config in without.items():
+        features = replace(paper.model.features, left_out=(name,))
+        assert config == replace(paper, model=replace(paper.model, features=features))
+    assert set(without) == set(WEIGHTS)
+
+
+def test_a_variant_keeps_what_it_does_not_name(tmp_path: Path) -> None:
+    (tmp_path / "one.yaml").write_text("# Others.\nmodel: {inference: {candidates: 4}}\n")
+    (tmp_path / "two.yaml").write_text("")
+    base = load("paper.yaml", "--learning.seed=7", "--experiment.pairs=[a, b]", "--model.features.left_out=[clustering.outlier]")
+    found = read_variants(tmp_path, base)
+    assert found["two"] == base
+    assert found["one"] == replace(base, model=replace(base.model, inference=replace(base.model.inference, candidates=4)))
+    assert found["one"].experiment.pairs == ("a", "b")
+
+
+# --- values that are refused ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("config", "name", "value"),
+    [
+        (InferenceConfig, "candidate_search", "luck"),
+        (InferenceConfig, "motion_metric", "plane"),
+        (ModelConfig, "start", "nowhere"),
+        (FeatureConfig, "left_out", ("association.dist2",)),
+        (FeatureConfig, "left_out", ("dist1",)),
+        (FeatureConfig, "left_out", ("clustering.outlier", "clustering.dist1")),
+        (ExperimentConfig, "protocols", ("leave_all_out",)),
+        (ExperimentConfig, "worlds", ("moon",)),
+        (ExperimentConfig, "also_train", ("moon",)),
+        (ExperimentConfig, "test_every", 0),
+        (ExperimentConfig, "resamples", 0),
+        (ExperimentConfig, "jobs", -1),
+    ],
+)
+def test_values_out_of_range_are_named(config: type, name: str, value: object) -> None:
+    last = value[-1] if isinstance(value, tuple) else value
+    with pytest.raises(ValueError, match=f"{'worlds' if name == 'also_train' else name}: expected .*, got {last}"):
+        config(**{name: value})
+
+
+def test_every_weight_can_be_left_out() -> None:
+    assert len(set(WEIGHTS)) == 30
+    assert FeatureConfig(left_out=WEIGHTS).left_out == WEIGHTS

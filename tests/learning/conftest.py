@@ -1,0 +1,43 @@
+"""A study of six small pairs and the models of one of its folds, made once for all tests of the experiment."""
+
+import pytest
+
+from torchcrf_scan.config import (
+    Config,
+    ExperimentConfig,
+    FeatureConfig,
+    InferenceConfig,
+    LearningConfig,
+    ModelConfig,
+    SimulatorConfig,
+)
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.learning.methods import Models, Study, fit_models
+from torchcrf_scan.scan import ScanPair
+
+
+@pytest.fixture(scope="session")
+def small_config() -> Config:
+    """So little of everything that a fold takes a second."""
+    return Config(
+        model=ModelConfig(features=FeatureConfig(stumps=4), inference=InferenceConfig(clusters=5, iterations=4)),
+        learning=LearningConfig(folds=2, max_steps=8, booster_examples=500, batch_size=2),
+        experiment=ExperimentConfig(jobs=1, resamples=50),
+    )
+
+
+@pytest.fixture(scope="session")
+def small_pairs() -> list[ScanPair]:
+    """Six pairs of three sequences."""
+    return simulate_pairs(SimulatorConfig(beams=61), 6, 3, 3)
+
+
+@pytest.fixture(scope="session")
+def study(small_pairs: list[ScanPair], small_config: Config) -> Study:
+    return Study.of(small_pairs, small_config, jobs=1)
+
+
+@pytest.fixture(scope="session")
+def models(study: Study, small_config: Config) -> Models:
+    """Fitted on the first four pairs."""
+    return fit_models(study, range(4), small_config, exact=True)

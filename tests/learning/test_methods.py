@@ -1,0 +1,150 @@
+"""Everything that is compared: every row answers, and only the rows that say so have seen the truth."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
+from torchcrf_scan.config import Config
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.learning.methods import (
+    EXACT,
+    JOINT,
+    LATTICE,
+    LATTICE_EXACT,
+    METHODS,
+    Answer,
+    Models,
+    Study,
+    answer,
+    fit_models,
+    with_config,
+    with_motions_given,
+)
+from torchcrf_scan.scan import PairPrediction, ScanPair
+
+ORACLES = ("joint, true motions", "joint, true associations")
+
+
+@pytest.fixture(scope="module")
+def answers(models: Models, small_pairs: list[ScanPair]) -> dict[str, Answer]:
+    """Of the last pair, which no model has seen."""
+    return answer(models, small_pairs[5])
+
+
+def test_every_row_that_can_be_there_is_there(answers: dict[str, Answer]) -> None:
+    assert len(set(METHODS)) == len(METHODS)
+    assert set(answers) == set(METHODS) - (set(LIBRARIES) - set(installed_libraries()))
+
+
+def test_a_library_has_its_row_where_it_is_installed(
+    answers: dict[str, Answer], models: Models, small_pairs: list[ScanPair], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    still = answers["all background"].prediction
+    monkeypatch.setattr("torchcrf_scan.learning.methods.installed_libraries", lambda: dict.fromkeys(LIBRARIES, lambda _: still))
+    found = answer(models, small_pairs[5])
+    assert set(found) == set(METHODS)
+    assert all(found[name].prediction is still for name in LIBRARIES)
+
+
+def test_answers_are_of_the_pair_and_took_time(answers: dict[str, Answer], small_pairs: list[ScanPair]) -> None:
+    beams = small_pairs[5].source.n_beams
+    for name, one in answers.items():
+        assert one.seconds > 0, name
+        assert one.prediction.association.shape == one.prediction.cluster.shape == (beams,), name
+        assert np.isfinite(one.prediction.motions).all(), name
+    for name in ("K-Means (ICP)", "K-Means (ICP), ego removed"):  # what they are fed with counts
+        assert answers[name].seconds > answers["ICP, tuned"].seconds
+        assert (answers[name].prediction.association == answers["ICP, tuned"].prediction.association).all()
+    assert answers["K-Means (CRF-Matching)"].seconds > answers["CRF-Matching"].seconds
+    assert (answers["CRF-Clustering"].prediction.association == answers["CRF-Matching"].prediction.association).all()
+
+
+def scrambled(pair: ScanPair) -> ScanPair:
+    """The same scans with another annotation of the same shape."""
+    truth = pair.annotation
+    assert truth is not None
+    association = np.where(truth.association >= 0, truth.association[::-1].clip(min=0), -1)
+    cluster = np.where(truth.cluster >= 0, (truth.cluster + 1) % len(truth.motions), -1)
+    other = replace(truth, association=association, cluster=cluster, motions=truth.motions + 0.3, body=np.maximum(cluster, 0))
+    return replace(pair, annotation=other)
+
+
+def differing(one: PairPrediction, other: PairPrediction) -> bool:
+    pairs = [(np.asarray(getattr(one, f.name)), np.asarray(getattr(other, f.name))) for f in fields(one)]
+    return any(a.shape != b.shape or not np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in pairs)
+
+
+def test_the_truth_reaches_the_two_rows_that_name_it_alone(
+    answers: dict[str, Answer], models: Models, small_pairs: list[ScanPair]
+) -> None:
+    lied_to = answer(models, scrambled(small_pairs[5]))
+    assert lied_to.keys() == answers.keys()
+    assert {name for name in answers if differing(answers[name].prediction, lied_to[name].prediction)} == set(ORACLES)
+
+
+def test_true_motions_and_true_associations_stay(answers: dict[str, Answer], small_pairs: list[ScanPair]) -> None:
+    pair = small_pairs[5]
+    truth = pair.annotation
+    assert truth is not None
+    found = answers["joint, true motions"].prediction.motions
+    for motion in found:
+        turn, shift = se2.distance(np.broadcast_to(motion, truth.motions.shape), truth.motions)
+        assert ((turn < 1e-5) & (shift < 1e-4)).any()
+    told = answers["joint, true associations"].prediction.association[pair.source.beam]
+    assert (told == truth.association[pair.source.beam]).all()
+
+
+def test_the_joint_model_alone_is_the_same_model(
+    study: Study, models: Models, small_pairs: list[ScanPair], small_config: Config
+) -> None:
+    config = replace(small_config, experiment=replace(small_config.experiment, joint_alone=True))
+    alone = fit_models(study, range(4), config, exact=True)
+    assert list(alone.joint) == [JOINT]
+    assert alone.cascade is None
+    for name, value in models.joint[JOINT].state_dict().items():
+        assert torch.equal(alone.joint[JOINT].state_dict()[name], value), name
+    assert list(answer(alone, small_pairs[5])) == [JOINT]
+
+
+def test_the_joint_models_share_their_features(models: Models) -> None:
+    assert list(models.joint) == [JOINT, EXACT, LATTICE, LATTICE_EXACT]
+    states = [model.state_dict() for model in models.joint.values()]
+    for name, value in states[0].items():
+        same = [torch.equal(state[name], value) for state in states[1:]]
+        assert all(same) or name.split(".")[0] in ("association_weights", "clustering_weights"), name
+    weights = [torch.cat(model.weight_vectors).detach() for model in models.joint.values()]
+    assert all(not torch.equal(one, other) for one, other in itertools.combinations(weights, 2))
+
+
+def joint_rows(answers: dict[str, Answer]) -> Sequence[str]:
+    return [name for name in answers if name.startswith("joint")]
+
+
+def test_a_lattice_may_be_the_joint_model(models: Models, small_pairs: list[ScanPair]) -> None:
+    lattice = replace(models, joint={JOINT: models.joint[LATTICE]})
+    assert joint_rows(answer(lattice, small_pairs[4])) == [JOINT, *ORACLES]
+
+
+def test_flooding_has_no_lattice_and_holds_true_motions_by_the_sweep(study: Study, small_config: Config) -> None:
+    inference = replace(small_config.model.inference, schedule="flooding")
+    config = replace(small_config, model=replace(small_config.model, inference=inference))
+    flooding = fit_models(study, range(4), config, exact=True)
+    assert list(flooding.joint) == [JOINT, EXACT]
+    given = with_motions_given(flooding.joint[JOINT]).config.inference
+    assert (given.schedule, given.motion_metric) == ("sweep", "given")
+
+
+def test_another_config_shares_the_weights(models: Models) -> None:
+    model = models.joint[JOINT]
+    before = model.config
+    other = with_config(model, replace(before, chains="clustering"))
+    assert (model.config, other.config.chains) == (before, "clustering")
+    for (name, mine), (_, theirs) in zip(model.named_parameters(), other.named_parameters(), strict=True):
+        assert mine is theirs, name
+    assert other.scales is model.scales
+    assert other.boosters is model.boosters

@@ -1,0 +1,83 @@
+"""`torchcrf-scan experiment`: the paper's experiment, and ablations of the model."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+from jsonargparse import ArgumentError, ArgumentParser
+
+from torchcrf_scan.config import Config
+
+
+def experiment(*, ablations: str | None = None, **settings: Any) -> int:
+    """Leaves pairs, then sequences, out in turn; fits every method on the rest; prints Tables I to III with intervals.
+
+    A killed run goes on where it was. Under `torchrun` every process takes its share of the folds.
+
+    Args:
+        ablations: folder of YAML files, each a variant of the settings; only the joint model is run, one table is printed
+        settings: the fields of `Config`
+    """
+    from torchcrf_scan.learning.experiment import run_ablations, run_experiment
+
+    config = Config(**{name: value for name, value in settings.items() if name != "config"})
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    if ablations is not None:
+        tables = run_ablations(config, read_variants(Path(ablations), config))
+    else:
+        tables = [table for of_protocol in run_experiment(config).values() for table in of_protocol]
+    print("\n".join(table.to_markdown() for table in tables), end="")
+    if tables:
+        print(f"\ntables, figures and predictions: {config.output}  (tensorboard --logdir {config.output})")
+    return 0
+
+
+def experiment_parser(summary: str) -> ArgumentParser:
+    """Options: every setting, from YAML files and one by one."""
+    usage = "torchcrf-scan experiment [--config CONFIG.yaml] [--ablations FOLDER] --output OUTPUT [settings]"
+    parser = ArgumentParser(description=summary, usage=usage)
+    parser.add_argument("--config", action="config", help="YAML file of settings")
+    parser.add_class_arguments(Config)
+    parser.add_argument("--ablations", type=str | None, help="folder of YAML files, each a variant: prints one table of them")
+    return parser
+
+
+def read_variants(folder: Path, config: Config) -> dict[str, Config]:
+    """The variants of `config` in a folder: one a YAML file, or with `experiment.leave_out` one for each feature named there.
+
+    Raises:
+        ValueError: no YAML file, or one with unknown settings.
+    """
+    files = sorted(folder.glob("*.yaml"))
+    if not files:
+        raise ValueError(f"--ablations {folder}: expected a folder of .yaml files, got none")
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_class_arguments(Config)
+    variants: dict[str, Config] = {}
+    config = replace(config, experiment=replace(config.experiment, leave_out=()))
+    for file in files:
+        variant = read_variant(parser, file, config)
+        left_out = variant.experiment.leave_out
+        variant = replace(variant, experiment=replace(variant.experiment, leave_out=()))
+        if not left_out:
+            variants[file.stem] = variant
+        for name in left_out:
+            features = replace(variant.model.features, left_out=(name,))
+            variants[f"without {name}"] = replace(variant, model=replace(variant.model, features=features))
+    return variants
+
+
+def read_variant(parser: ArgumentParser, file: Path, config: Config) -> Config:
+    """`config` with the settings of one file changed."""
+    try:
+        changes = yaml.safe_load(file.read_text()) or {}
+        if not isinstance(changes, dict):
+            raise ValueError(f"expected settings, one a line as NAME: VALUE, got {changes!r}")
+        base = parser.parse_object(asdict(config))
+        return Config(**vars(parser.instantiate(parser.parse_object(changes, base))))
+    except (ArgumentError, yaml.YAMLError, ValueError, TypeError) as error:
+        raise ValueError(f"{file}: {error}") from error

@@ -1,0 +1,179 @@
+"""Everything that the experiment compares: fitted on the training pairs of one fold, asked about a pair it has not seen."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from joblib import Parallel, delayed
+
+from torchcrf_scan.baselines.cascade import Cascade
+from torchcrf_scan.baselines.icp import GATES, choose_gate, found_shares, match_background, match_icp
+from torchcrf_scan.baselines.kmeans import cluster_displacements
+from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
+from torchcrf_scan.baselines.ransac import match_ransac
+from torchcrf_scan.baselines.start import label_nearest
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.config import Config, LearningConfig, ModelConfig
+from torchcrf_scan.inference.initialise import Start, nearest_association
+from torchcrf_scan.inference.pseudo_likelihood import true_plugins
+from torchcrf_scan.learning.cascade_fit import fit_cascade
+from torchcrf_scan.learning.fit import fit
+from torchcrf_scan.learning.material import Collection, collect
+from torchcrf_scan.learning.plugins import reach_of_truth
+from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.scan import Floats, PairPrediction, ScanPair
+
+JOINT, EXACT = "joint", "joint, exact likelihood"
+LATTICE, LATTICE_EXACT = "joint, lattice", "joint, lattice, exact likelihood"
+HELD_ROUNDS = 10
+METHODS = (
+    *("all background", "ICP", "ICP, tuned", *LIBRARIES, "trimmed ICP + RANSAC"),
+    *("K-Means (ICP)", "K-Means (ICP), ego removed", "CRF-Matching"),
+    *("K-Means (CRF-Matching)", "K-Means (CRF-Matching), ego removed", "CRF-Clustering", "start + gated NN"),
+    *(JOINT, EXACT, LATTICE, LATTICE_EXACT, "joint, true motions", "joint, true associations"),
+)  # rows of every table, in this order
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """The pairs of an experiment and what is found in them once for all folds.
+
+    Attributes:
+        pairs: P annotated pairs. collection: the same, as learning sees them.
+        icp_shares: (P, G) outliers that ICP finds with every one of its `GATES`.
+    """
+
+    pairs: tuple[ScanPair, ...]
+    collection: Collection
+    icp_shares: Floats
+
+    @classmethod
+    def of(cls, pairs: Sequence[ScanPair], config: Config, jobs: int) -> Study:
+        """Looks at the pairs, on `jobs` cores. Raises ValueError for pairs without annotation."""
+        collection = collect(pairs, config.learning, jobs)
+        if config.experiment.joint_alone:
+            return cls(tuple(pairs), collection, np.zeros((len(pairs), len(GATES))))
+        shares = Parallel(n_jobs=jobs)(delayed(found_shares)(pair, GATES) for pair in pairs)
+        return cls(tuple(pairs), collection, np.stack(shares))
+
+
+@dataclass(frozen=True, slots=True)
+class Models:
+    """What was fitted on one fold. The joint models by the name of their row; the cascade and the gate only beside baselines."""
+
+    joint: dict[str, JointScanCRF]
+    cascade: Cascade | None = None
+    icp_gate: float = np.inf
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A method's prediction and the seconds that it took, the shared start included."""
+
+    prediction: PairPrediction
+    seconds: float
+
+
+def fit_models(study: Study, train: Sequence[int], config: Config, exact: bool) -> Models:
+    """Refits everything on the pairs `train`: the movers' score, scales, boosters, weights, and ICP's gate."""
+    score = study.collection.fit_score(train)
+    material = study.collection.material(train, score, config.model.inference.clusters - 1, config.learning)
+    joint = JointScanCRF(config.model)
+    joint.hypothesis_score = score
+    margins = fit(joint, material, config.learning)
+    if config.experiment.joint_alone:
+        return Models({JOINT: joint})
+    models = {JOINT: joint}
+    for name, model, learning in other_joint_models(config, exact):
+        models[name] = JointScanCRF(model)
+        models[name].hypothesis_score = score
+        fit(models[name], material, learning, features_of=(joint, margins))
+    cascade = fit_cascade(material, config)
+    return Models(models, cascade, choose_gate(study.icp_shares[list(train)], GATES))
+
+
+def other_joint_models(config: Config, exact: bool) -> list[tuple[str, ModelConfig, LearningConfig]]:
+    """Name, model and learning of the joint models beside the configured one: both labels in one lattice, fitted exactly."""
+    exactly = replace(config.learning, objective="likelihood", predicted_share=0.5)
+    lattice = replace(config.model, coupling="lattice")
+    others = [(LATTICE, lattice, config.learning)]
+    if exact and config.learning.objective != "likelihood":
+        others += [(EXACT, config.model, exactly), (LATTICE_EXACT, lattice, exactly)]
+    has_lattice = config.model.inference.schedule == "sweep"
+    return [other for other in others if has_lattice or other[1].coupling != "lattice"]
+
+
+@torch.no_grad()
+def answer(models: Models, pair: ScanPair) -> dict[str, Answer]:
+    """Every method's answer for an annotated pair, timed one by one. The truth is told to the two rows that name it alone."""
+    found: dict[str, Answer] = {}
+
+    def ask(name: str, run: Callable[[], PairPrediction], before: float = 0.0) -> Answer:
+        began = time.perf_counter()
+        prediction = run()
+        found[name] = Answer(prediction, before + time.perf_counter() - began)
+        return found[name]
+
+    if models.cascade is not None:
+        ask("all background", lambda: match_background(pair))
+        ask("ICP", lambda: match_icp(pair))
+        icp = ask("ICP, tuned", lambda: match_icp(pair, gate=models.icp_gate))
+        for name, method in installed_libraries().items():
+            ask(name, lambda method=method: method(pair))  # type: ignore[misc]
+        ask("trimmed ICP + RANSAC", lambda: match_ransac(pair))
+        ask("K-Means (ICP)", lambda: cluster_displacements(pair, icp.prediction), icp.seconds)
+        ask("K-Means (ICP), ego removed", lambda: cluster_displacements(pair, icp.prediction, remove_motion=True), icp.seconds)
+
+    annotated = ScanPairBatch.collate([pair])
+    batch = annotated.without_truth()
+    began = time.perf_counter()
+    start = models.joint[JOINT].initialise(batch)
+    before = time.perf_counter() - began
+    if models.cascade is not None:
+        cascade = models.cascade
+        matched = ask("CRF-Matching", lambda: cascade.matching(batch, start.background_alone()).pair(0, pair), before)
+        ask("K-Means (CRF-Matching)", lambda: cluster_displacements(pair, matched.prediction), matched.seconds)
+        ask(
+            "K-Means (CRF-Matching), ego removed",
+            lambda: cluster_displacements(pair, matched.prediction, remove_motion=True),
+            matched.seconds,
+        )
+        ask("CRF-Clustering", lambda: cascade(batch, start).pair(0, pair), before)
+        ask("start + gated NN", lambda: label_nearest(batch, start).pair(0, pair), before)
+    for name, model in models.joint.items():
+        ask(name, lambda model=model: model(batch, start).pair(0, pair), before)  # type: ignore[misc]
+    if models.cascade is not None:
+        joint = models.joint[JOINT]
+        at_truth = with_motions_given(joint)
+        ask("joint, true motions", lambda: at_truth(batch, true_start(annotated, start)).pair(0, pair))
+        told = with_config(joint, replace(joint.config, chains="clustering", coupling="motions"))
+        associated = replace(start, association=annotated.truth.association)  # type: ignore[union-attr]
+        ask("joint, true associations", lambda: told(batch, associated).pair(0, pair), before)
+    return found
+
+
+def with_config(model: JointScanCRF, config: ModelConfig) -> JointScanCRF:
+    """The same weights under another config."""
+    other = copy.copy(model)
+    other.config = config
+    return other
+
+
+def with_motions_given(model: JointScanCRF) -> JointScanCRF:
+    """The same model, its motions held where they start; labels that swing have no motions to be damped, so its rounds are few."""
+    rounds = min(model.config.inference.iterations, HELD_ROUNDS)
+    inference = replace(model.config.inference, motion_metric="given", schedule="sweep", iterations=rounds)
+    return with_config(model, replace(model.config, inference=inference))
+
+
+def true_start(batch: ScanPairBatch, found: Start) -> Start:
+    """The annotated motions of as many movers as there is room for, `batch` being annotated."""
+    truth = true_plugins(batch, found.motions.shape[1])
+    reach = reach_of_truth(truth, batch)
+    association = nearest_association(batch, truth.motions, truth.active, reach)
+    return Start(truth.motions, truth.active, association, found.target_tangents, reach)
