@@ -278,8 +278,8 @@ class ExperimentConfig:
         joint_alone: of all the methods, only the joint model (for ablations).
         test_every: test every so many pairs only, for models that are slow to decode.
         leave_out: features, named as in `FeatureConfig.left_out`: a variant without each of them (for ablations).
-        exact: in leave_one_sequence_out, joint models fitted by exact likelihood too (half of a fold's time).
-        figures: pairs to draw, as SEQUENCE:NUMBER, the number counting from 0; none: one of every sequence.
+        joint_variants: in leave_one_sequence_out, the joint model by exact likelihood and as a lattice too (half of a fold's time).
+        figures: pairs to draw, as SEQUENCE:NUMBER, the number counting from 0; none: one of each of the first three.
         resamples: of the bootstrap.
         jobs: processes; 0: one a core.
     """
@@ -291,7 +291,7 @@ class ExperimentConfig:
     joint_alone: bool = False
     test_every: int = 1
     leave_out: tuple[str, ...] = ()
-    exact: bool = True
+    joint_variants: bool = True
     figures: tuple[str, ...] = ()
     resamples: int = 2000
     jobs: int = 0

@@ -135,7 +135,7 @@ def test_running_the_model_gives_the_figures_of_its_files(
     assert from_model["all"] == from_files["all"]
 
 
-@pytest.mark.parametrize("method", ["start", "static"])
+@pytest.mark.parametrize("method", ["start", "static", "background", "icp", "ransac"])
 def test_other_methods(pairs_dir: Path, model_dir: Path, tmp_path: Path, method: str, capsys: pytest.CaptureFixture[str]) -> None:
     out, figures = evaluate(capsys, tmp_path / "f.json", pairs_dir, "--method", method, "--model", model_dir)
     pairs = list(PairFiles(pairs_dir))
@@ -157,7 +157,7 @@ def test_evaluate_names_the_bad_argument(
     moving_pair: tuple[ScanPair, PairPrediction],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert "joint, start, static" in fail(capsys, "evaluate", pairs_dir, "--method=magic")
+    assert "joint, start, static, background, icp, ransac" in fail(capsys, "evaluate", pairs_dir, "--method=magic")
     assert "--predictions" in fail(capsys, "evaluate", pairs_dir, "--predictions", predictions_dir, "--method=joint")
     assert "none for 4 of 4, the first sim_s0_000.npz" in fail(capsys, "evaluate", pairs_dir, "--predictions", tmp_path)
     assert "source_ranges" in fail(capsys, "evaluate", predictions_dir, "--predictions", predictions_dir)

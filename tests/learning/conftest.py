@@ -40,4 +40,4 @@ def study(small_pairs: list[ScanPair], small_config: Config) -> Study:
 @pytest.fixture(scope="session")
 def models(study: Study, small_config: Config) -> Models:
     """Fitted on the first four pairs."""
-    return fit_models(study, range(4), small_config, exact=True)
+    return fit_models(study, range(4), small_config, variants=True)

@@ -47,12 +47,12 @@ class Recorder:
     def __init__(self, fail_at: str = "") -> None:
         self.trained: list[tuple[int, ...]] = []
         self.asked: list[str] = []
-        self.exact: list[bool] = []
+        self.variants: list[bool] = []
         self.fail_at = fail_at
 
-    def fit_models(self, study: Study, train: Sequence[int], config: object, exact: bool) -> Models:
+    def fit_models(self, study: Study, train: Sequence[int], config: object, variants: bool) -> Models:
         self.trained.append(tuple(train))
-        self.exact.append(exact)
+        self.variants.append(variants)
         return Models({})
 
     def answer(self, models: Models, pair: ScanPair) -> dict[str, Answer]:

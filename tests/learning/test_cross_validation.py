@@ -102,7 +102,7 @@ def test_finished_folds_are_not_run_again(tmp_path: Path, monkeypatch: pytest.Mo
     assert run(tmp_path, pairs, folds) == 1
     assert sorted(recorder.asked) == sorted(2 * [pair.name for pair in pairs])
     assert recorder.trained == [fold.train for of_protocol in folds.values() for fold in of_protocol]
-    assert recorder.exact == [False] * 4 + [True] * 3  # the slow lattice in one protocol alone
+    assert recorder.variants == [False] * 4 + [True] * 3  # the slow lattice in one protocol alone
     assert run(tmp_path, pairs, folds) == 0
     assert len(recorder.asked) == 8
     (tmp_path / BY_SEQUENCE / "c" / SECONDS).unlink()

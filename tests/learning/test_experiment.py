@@ -13,9 +13,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from torchcrf_scan.config import Config, ExperimentConfig, InferenceConfig, LearningConfig, ModelConfig
 from torchcrf_scan.data.pair_file import write_pair
+from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.evaluation.report import Table
 from torchcrf_scan.learning import experiment as module
-from torchcrf_scan.learning.cross_validation import Results
 from torchcrf_scan.learning.experiment import (
     claim,
     differing,
@@ -123,9 +123,9 @@ def test_tables_are_written_as_text_and_numbers(tmp_path: Path) -> None:
 def test_the_worst_pairs_are_those_that_lose_most_against_the_start() -> None:
     pairs = make_pairs(*"abcdef")
     mistakes = {JOINT: [2, 0, 5, 1, 4, 1], RIVAL: [1, 4, 1, 1, 0, 0]}  # losses: 1, -4, 4, 0, 4, 1
-    predictions = {name: [guess(pair, many) for pair, many in zip(pairs, of, strict=True)] for name, of in mistakes.items()}
-    assert worst_pairs(Results(tuple(pairs), predictions, {})) == [2, 4, 0]
-    assert worst_pairs(Results(tuple(pairs[:2]), {name: of[:2] for name, of in predictions.items()}, {})) == [0]
+    scores = {name: [score_pair(p, guess(p, many)) for p, many in zip(pairs, of, strict=True)] for name, of in mistakes.items()}
+    assert worst_pairs(scores) == [2, 4, 0]
+    assert worst_pairs({name: of[:2] for name, of in scores.items()}) == [0]
 
 
 @pytest.fixture

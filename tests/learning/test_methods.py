@@ -103,7 +103,7 @@ def test_the_joint_model_alone_is_the_same_model(
     study: Study, models: Models, small_pairs: list[ScanPair], small_config: Config
 ) -> None:
     config = replace(small_config, experiment=replace(small_config.experiment, joint_alone=True))
-    alone = fit_models(study, range(4), config, exact=True)
+    alone = fit_models(study, range(4), config, variants=True)
     assert list(alone.joint) == [JOINT]
     assert alone.cascade is None
     for name, value in models.joint[JOINT].state_dict().items():
@@ -133,7 +133,7 @@ def test_a_lattice_may_be_the_joint_model(models: Models, small_pairs: list[Scan
 def test_flooding_has_no_lattice_and_holds_true_motions_by_the_sweep(study: Study, small_config: Config) -> None:
     inference = replace(small_config.model.inference, schedule="flooding")
     config = replace(small_config, model=replace(small_config.model, inference=inference))
-    flooding = fit_models(study, range(4), config, exact=True)
+    flooding = fit_models(study, range(4), config, variants=True)
     assert list(flooding.joint) == [JOINT, EXACT]
     given = with_motions_given(flooding.joint[JOINT]).config.inference
     assert (given.schedule, given.motion_metric) == ("sweep", "given")

@@ -6,6 +6,7 @@ import json as json_format
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +24,20 @@ if TYPE_CHECKING:
 Method = Callable[[Sequence[ScanPair]], list[PairPrediction]]
 Loader = Callable[[], JointScanCRF]
 
+
+def one_by_one(module: str, name: str) -> Method:
+    """A baseline that takes one pair, imported when it is asked for: it needs scipy."""
+    match = getattr(import_module(f"torchcrf_scan.baselines.{module}"), name)
+    return lambda pairs: [match(pair) for pair in pairs]
+
+
 METHODS: dict[str, Callable[[Loader], Method]] = {
     "joint": lambda load: load().match_pairs,
     "start": lambda load: partial(match_start, load()),
     "static": lambda load: match_static,
+    "background": lambda load: one_by_one("icp", "match_background"),
+    "icp": lambda load: one_by_one("icp", "match_icp"),
+    "ransac": lambda load: one_by_one("ransac", "match_ransac"),
 }
 
 
@@ -48,7 +59,8 @@ def evaluate(
     Args:
         files: pair files with annotation
         predictions: folder of prediction files named like the pair files, instead of a method
-        method: joint (the model), start (its start and nearest points, no field) or static (nothing moves); joint where absent
+        method: joint (the model, where absent), start (its start and nearest points, no field), static (nothing moves), background
+            (one registration, all of it background), icp (the paper's) or ransac (registration, then movers by RANSAC)
         model: folder of a saved model, or the name of one that the package ships; simulated where absent
         json: file for all figures with all digits
         candidates: target points considered for each source point, 0 for all; as the model was saved where absent

@@ -108,8 +108,8 @@ def run_fold(study_file: Path, protocol: str, fold: Fold, folder: Path) -> None:
     """Fits on the fold's training pairs, asks about its test pairs and leaves the fold's folder behind."""
     torch.set_num_threads(1)
     study, config = load_study(study_file)
-    exact = config.experiment.exact and protocol == "leave_one_sequence_out"
-    models = fit_models(study, fold.train, config, exact)
+    variants = config.experiment.joint_variants and protocol == "leave_one_sequence_out"
+    models = fit_models(study, fold.train, config, variants)
     answers = {study.pairs[k].name: answer(models, study.pairs[k]) for k in fold.test}
     write_fold(folder, answers)
 

@@ -19,7 +19,7 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.evaluation.ablation import ablation_table
 from torchcrf_scan.evaluation.bootstrap import by_blocks, by_sequence
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
-from torchcrf_scan.evaluation.report import Table, differences_table, report
+from torchcrf_scan.evaluation.report import Scores, Table, differences_table, report
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.learning.cross_validation import Results, cores, file_name, make_folds, rank_and_world, read_folds, run_folds
 from torchcrf_scan.learning.methods import EXACT, JOINT, Study
@@ -34,6 +34,7 @@ ALSO_TRAIN_SEED = 5_000  # of the worlds that every fold trains on, far from tho
 ASSOCIATION_FIGURE = ("ICP, tuned", "CRF-Matching", "start + gated NN", JOINT)  # the paper's Fig. 3, and the start
 CLUSTER_FIGURE = ("K-Means (ICP)", "K-Means (CRF-Matching)", "CRF-Clustering", JOINT)  # the paper's Fig. 4
 RIVAL = "start + gated NN"
+DRAWN = 3  # sequences whose first pair is drawn where none is asked for
 LOSSES = 3  # pictures of the pairs where the joint model loses most against the rival
 ABLATED = "leave_one_sequence_out"
 
@@ -59,13 +60,14 @@ def run_experiment(config: Config) -> dict[str, list[Table]]:
     run_folds(lambda jobs: Study.of(pairs, config, jobs), folds, config, folder / "folds", cores(config.experiment.jobs))
     if rank_and_world()[0] != 0:
         return {}
+    tables = {}
     with RunLog(folder) as run:
-        results = {protocol: read_folds(folder / "folds" / protocol, pairs, of_protocol) for protocol, of_protocol in folds.items()}
-        tables = {protocol: tabulate(found, protocol, config, run) for protocol, found in results.items()}
-        for protocol, found in results.items():
-            draw(found, figures, folder / "figures" / protocol, run)
-    for protocol, of_protocol in tables.items():
-        write_tables(folder / "tables", protocol, of_protocol)
+        for protocol, of_protocol in folds.items():
+            results = read_folds(folder / "folds" / protocol, pairs, of_protocol)
+            scores = score(results)
+            tables[protocol] = tabulate(scores, results.seconds, protocol, config, run)
+            write_tables(folder / "tables", protocol, tables[protocol])
+            draw(results, scores, figures, folder / "figures" / protocol, run)
     return tables
 
 
@@ -154,12 +156,12 @@ def differing(ours: Mapping[str, object], theirs: Mapping[str, object], prefix: 
 
 
 def find_pairs(wanted: Sequence[str], pairs: Sequence[ScanPair]) -> list[ScanPair]:
-    """The pairs named SEQUENCE:NUMBER; the first of every sequence where none is. Raises ValueError for one that is not there."""
+    """The pairs named SEQUENCE:NUMBER (ValueError where there is none such); without names the first of the first sequences."""
     by_sequence: dict[str, list[ScanPair]] = {}
     for pair in pairs:
         by_sequence.setdefault(pair.sequence, []).append(pair)
     if not wanted:
-        return [of_sequence[0] for of_sequence in by_sequence.values()]
+        return [of_sequence[0] for of_sequence in by_sequence.values()][:DRAWN]
     found = []
     for name in wanted:
         sequence, _, number = name.rpartition(":")
@@ -185,10 +187,9 @@ def resample(scores: Sequence[PairScore], config: Config) -> Ints:
     return draw([one.sequence for one in scores], resamples=config.experiment.resamples)
 
 
-def tabulate(results: Results, protocol: str, config: Config, run: RunLog) -> list[Table]:
+def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: str, config: Config, run: RunLog) -> list[Table]:
     """Overview, Tables I to III and the differences of one protocol, logged as well."""
-    scores = score(results)
-    tables = report(scores, seconds=results.seconds, published=True)
+    tables = report(scores, seconds=seconds, published=True)
     weights = resample(scores[JOINT], config)
     tables += [differences_table(name, scores, weights) for name in (JOINT, EXACT) if name in scores and len(scores) > 1]
     tables = [replace(table, title=f"{table.title} ({protocol.replace('_', ' ')})") for table in tables]
@@ -199,7 +200,7 @@ def tabulate(results: Results, protocol: str, config: Config, run: RunLog) -> li
     return tables
 
 
-def draw(results: Results, pairs: Sequence[ScanPair], folder: Path, run: RunLog) -> None:
+def draw(results: Results, scores: Scores, pairs: Sequence[ScanPair], folder: Path, run: RunLog) -> None:
     """The paper's Figures 3 and 4 of the chosen pairs, and the pairs where the joint model loses most against its start."""
     index = {pair.name: k for k, pair in enumerate(results.pairs)}
 
@@ -217,14 +218,13 @@ def draw(results: Results, pairs: Sequence[ScanPair], folder: Path, run: RunLog)
                 save_figure(figure, folder / f"{kind}_{file_name(pair.name)}.png")
                 run.figure(f"{folder.name}/{kind}/{pair.name}", figure)
     if RIVAL in results.predictions:
-        for k in worst_pairs(results):
+        for k in worst_pairs(scores):
             figure = plot_associations(results.pairs[k], answers((RIVAL, JOINT), k))
             save_figure(figure, folder / f"loss_{file_name(results.pairs[k].name)}.png")
 
 
-def worst_pairs(results: Results) -> list[int]:
+def worst_pairs(scores: Scores) -> list[int]:
     """The pairs where the joint model has most labels less right than its start has, both chains together."""
-    scores = score(results)
     right = {name: np.array([one.association.right + one.cluster.right for one in scores[name]]) for name in (JOINT, RIVAL)}
     loss = right[RIVAL] - right[JOINT]
     return [int(k) for k in np.argsort(-loss, kind="stable")[:LOSSES] if loss[k] > 0]

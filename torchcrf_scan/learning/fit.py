@@ -68,12 +68,12 @@ def fit(
     live = live_weights(model.config.features)
     predicted = [lesson.start.association for lesson in lessons]
     if chains != "clustering":
-        features = [association_chain(model, lesson, margins[lesson.fold]) for lesson in lessons]
+        features = (association_chain(model, lesson, margins[lesson.fold]) for lesson in lessons)
         set_weights(model, "association", fit_chain(features, live[0], config, watch.get("association")))
         predicted = [predict_association(model, lesson, margins[lesson.fold]) for lesson in lessons]
     if chains != "matching":
-        chain = [clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True)]
-        set_weights(model, "clustering", fit_chain(chain, live[1], config, watch.get("clustering")))
+        features = (clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True))
+        set_weights(model, "clustering", fit_chain(features, live[1], config, watch.get("clustering")))
     return margins
 
 
@@ -100,7 +100,7 @@ def fit_lattice(
 ) -> None:
     """All 30 weights at once; no association is plugged in, so `config.predicted_share` says nothing."""
     inference = model.config.inference
-    features = [lattice_chain(of.view, of.plugins, model.scales, margins[of.fold], inference) for of in lessons]
+    features = (lattice_chain(of.view, of.plugins, model.scales, margins[of.fold], inference) for of in lessons)
     live = torch.cat(live_weights(model.config.features))
     association, clustering = fit_chain(features, live, config, watch).split([len(ASSOCIATION_WEIGHTS), len(CLUSTERING_WEIGHTS)])
     set_weights(model, "association", association)

@@ -70,7 +70,7 @@ class Collection:
 
 
 def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) -> Collection:
-    """Looks at the pairs, on `jobs` cores; what is drawn at random for a pair does not depend on `jobs`.
+    """Looks at the pairs, on `jobs` cores (-1: all); what is drawn at random for a pair does not depend on `jobs`.
 
     Raises:
         ValueError: a pair without annotation, or no pair.

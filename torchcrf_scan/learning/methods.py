@@ -79,17 +79,20 @@ class Answer:
     seconds: float
 
 
-def fit_models(study: Study, train: Sequence[int], config: Config, exact: bool) -> Models:
-    """Refits everything on the pairs `train`: the movers' score, scales, boosters, weights, and ICP's gate."""
+def fit_models(study: Study, train: Sequence[int], config: Config, variants: bool) -> Models:
+    """Refits everything on the pairs `train`: the movers' score, scales, boosters, weights, and ICP's gate.
+
+    variants: of the joint model as well, see `joint_variants`.
+    """
     score = study.collection.fit_score(train)
     material = study.collection.material(train, score, config.model.inference.clusters - 1, config.learning)
     joint = JointScanCRF(config.model)
     joint.hypothesis_score = score
     margins = fit(joint, material, config.learning)
-    if config.experiment.joint_alone:
-        return Models({JOINT: joint})
     models = {JOINT: joint}
-    for name, model, learning in other_joint_models(config, exact):
+    if config.experiment.joint_alone:
+        return Models(models)
+    for name, model, learning in joint_variants(config) if variants else []:
         models[name] = JointScanCRF(model)
         models[name].hypothesis_score = score
         fit(models[name], material, learning, features_of=(joint, margins))
@@ -97,15 +100,15 @@ def fit_models(study: Study, train: Sequence[int], config: Config, exact: bool) 
     return Models(models, cascade, choose_gate(study.icp_shares[list(train)], GATES))
 
 
-def other_joint_models(config: Config, exact: bool) -> list[tuple[str, ModelConfig, LearningConfig]]:
-    """Name, model and learning of the joint models beside the configured one: both labels in one lattice, fitted exactly."""
+def joint_variants(config: Config) -> list[tuple[str, ModelConfig, LearningConfig]]:
+    """Name, model and learning of the joint model fitted exactly, with both labels in one lattice, and both, where they differ."""
     exactly = replace(config.learning, objective="likelihood", predicted_share=0.5)
     lattice = replace(config.model, coupling="lattice")
-    others = [(LATTICE, lattice, config.learning)]
-    if exact and config.learning.objective != "likelihood":
-        others += [(EXACT, config.model, exactly), (LATTICE_EXACT, lattice, exactly)]
+    variants = [(EXACT, config.model, exactly), (LATTICE, lattice, config.learning), (LATTICE_EXACT, lattice, exactly)]
+    if config.learning.objective == "likelihood":
+        variants = [(LATTICE, lattice, config.learning)]
     has_lattice = config.model.inference.schedule == "sweep"
-    return [other for other in others if has_lattice or other[1].coupling != "lattice"]
+    return [variant for variant in variants if has_lattice or variant[1].coupling != "lattice"]
 
 
 @torch.no_grad()

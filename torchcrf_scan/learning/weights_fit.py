@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -36,15 +36,18 @@ def flatten(designs: Sequence[Design]) -> Design:
     return Design(features, mask, label, torch.ones_like(label, dtype=torch.bool))
 
 
-def fit_chain(chains: Sequence[AnyChain], live: Tensor, config: LearningConfig, watch: Watch | None = None) -> Tensor:
+def fit_chain(chains: Iterable[AnyChain], live: Tensor, config: LearningConfig, watch: Watch | None = None) -> Tensor:
     """The weights of a chain or the lattice by `config.objective`: pseudo-likelihood, or from its optimum on exact likelihood.
 
     Args:
+        chains: batches; pseudo-likelihood looks at one after the other and keeps no transitions, of which dense chains have many.
         live: (W,) 1 for the weights that are learned, 0 for those that stay 0.
 
     Returns:
         (W,) float64.
     """
+    is_exact = config.objective == "likelihood"
+    chains = list(chains) if is_exact else chains
     design = flatten([chain.design() for chain in chains])
     done = 0
 
@@ -55,9 +58,9 @@ def fit_chain(chains: Sequence[AnyChain], live: Tensor, config: LearningConfig, 
             watch(done, loss, slope, weights)
 
     weights = fit_weights(design, config, look, live=live)
-    if config.objective == "pseudo_likelihood":
+    if not is_exact:
         return weights
-    exact = stack(chains)
+    exact = stack(list(chains))
     return fit_weights(design, config, look, live=live, start=weights, log_likelihood=lambda w: exact.log_likelihood(w).sum())
 
 
@@ -138,6 +141,7 @@ def fit_weights(
             watch(step, latest["loss"], latest["slope"], torch.from_numpy(intermediate_result.x) * per_unit)
 
     first = torch.zeros_like(per_unit) if start is None else torch.where(per_unit > 0, start / per_unit.clamp(min=1e-12), 0.0)
-    options = {"maxiter": config.max_steps, "gtol": config.tolerance, "ftol": 0.0, "maxcor": 10}
+    idle = 0.0 if log_likelihood is None else 0.1 * config.tolerance  # relative gain of a step: exact ones are dear
+    options = {"maxiter": config.max_steps, "gtol": config.tolerance, "ftol": idle, "maxcor": 10}
     found = minimize(objective, first.numpy(), jac=True, method="L-BFGS-B", callback=look, options=options)
     return torch.from_numpy(found.x) * per_unit

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_COLUMNS = 4
+MAX_COLUMNS = 5
 
 
 def plot_pair(pair: ScanPair, prediction: PairPrediction | None = None) -> Figure:

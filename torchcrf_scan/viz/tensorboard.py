@@ -36,7 +36,8 @@ class RunLog:
         """One optimiser step of one chain: objective and gradient per node, and every weight by name."""
         self.writer.add_scalar(f"objective/{tag}", loss, step)
         self.writer.add_scalar(f"gradient/{tag}", slope, step)
-        names = ASSOCIATION_WEIGHTS if len(weights) == len(ASSOCIATION_WEIGHTS) else CLUSTERING_WEIGHTS
+        both = (*(f"association/{name}" for name in ASSOCIATION_WEIGHTS), *(f"clustering/{name}" for name in CLUSTERING_WEIGHTS))
+        names = {len(of): of for of in (ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, both)}[len(weights)]
         for name, value in zip(names, weights.tolist(), strict=True):
             self.writer.add_scalar(f"weights/{tag}/{name}", value, step)
 
