@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
+import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
@@ -19,10 +20,11 @@ from torchcrf_scan.baselines.ransac import match_ransac
 from torchcrf_scan.baselines.start import label_nearest
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import Config, LearningConfig, ModelConfig
+from torchcrf_scan.features.scales import LOCAL_CHANNELS
 from torchcrf_scan.inference.initialise import Start, nearest_association
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.learning.cascade_fit import fit_cascade
-from torchcrf_scan.learning.fit import fit
+from torchcrf_scan.learning.fit import Margins, fit
 from torchcrf_scan.learning.material import Collection, collect
 from torchcrf_scan.learning.plugins import reach_of_truth
 from torchcrf_scan.model import JointScanCRF
@@ -37,6 +39,9 @@ METHODS = (
     *("K-Means (CRF-Matching)", "K-Means (CRF-Matching), ego removed", "CRF-Clustering", "start + gated NN"),
     *(JOINT, EXACT, LATTICE, LATTICE_EXACT, "joint, true motions", "joint, true associations"),
 )  # rows of every table, in this order
+
+
+_fitted_features: dict[str, tuple[JointScanCRF, Margins]] = {}  # of this process, by `features_key`
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +93,11 @@ def fit_models(study: Study, train: Sequence[int], config: Config, variants: boo
     material = study.collection.material(train, score, config.model.inference.clusters - 1, config.learning)
     joint = JointScanCRF(config.model)
     joint.hypothesis_score = score
-    margins = fit(joint, material, config.learning)
+    key = features_key(study, train, config)
+    margins = fit(joint, material, config.learning, features_of=_fitted_features.get(key))
     models = {JOINT: joint}
     if config.experiment.joint_alone:
+        _fitted_features.setdefault(key, (joint, margins))
         return Models(models)
     for name, model, learning in joint_variants(config) if variants else []:
         models[name] = JointScanCRF(model)
@@ -100,15 +107,26 @@ def fit_models(study: Study, train: Sequence[int], config: Config, variants: boo
     return Models(models, cascade, choose_gate(study.icp_shares[list(train)], GATES))
 
 
+def features_key(study: Study, train: Sequence[int], config: Config) -> str:
+    """Names everything that scales and boosters depend on: most ablations share them."""
+    learning, features, inference = (asdict(part) for part in (config.learning, config.model.features, config.model.inference))
+    for name in ("objective", "predicted_share", "prior", "max_steps", "tolerance"):
+        learning.pop(name)
+    features["left_out"] = [name for name in features["left_out"] if name.removeprefix("association.") in LOCAL_CHANNELS]
+    features.pop("raw_channels")
+    states = [inference[name] for name in ("clusters", "candidates", "candidate_search")]
+    return json.dumps([study.collection.names, list(train), learning, features, states])
+
+
 def joint_variants(config: Config) -> list[tuple[str, ModelConfig, LearningConfig]]:
     """Name, model and learning of the joint model fitted exactly, with both labels in one lattice, and both, where they differ."""
     exactly = replace(config.learning, objective="likelihood", predicted_share=0.5)
-    lattice = replace(config.model, coupling="lattice")
-    variants = [(EXACT, config.model, exactly), (LATTICE, lattice, config.learning), (LATTICE_EXACT, lattice, exactly)]
-    if config.learning.objective == "likelihood":
-        variants = [(LATTICE, lattice, config.learning)]
-    has_lattice = config.model.inference.schedule == "sweep"
-    return [variant for variant in variants if has_lattice or variant[1].coupling != "lattice"]
+    variants = [] if config.learning.objective == "likelihood" else [(EXACT, config.model, exactly)]
+    if config.model.inference.schedule == "sweep":  # the lattice has no other
+        lattice = replace(config.model, coupling="lattice")
+        learned = {LATTICE: config.learning} if not variants else {LATTICE: config.learning, LATTICE_EXACT: exactly}
+        variants += [(name, lattice, learning) for name, learning in learned.items()]
+    return variants
 
 
 @torch.no_grad()
