@@ -34,7 +34,7 @@ class Collection:
     """Annotated pairs with all that takes long to find and depends neither on other pairs nor on anything learned.
 
     Attributes:
-        sequences: of every pair. names: of every pair.
+        names, sequences: of every pair.
         batch: all P pairs, disturbed as moving sensors disturb them.
         surveys: P what InitialiseRT looks at in the disturbed pairs.
         views: P lists of what the movers' score is fitted on.

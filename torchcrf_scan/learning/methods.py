@@ -32,14 +32,13 @@ from torchcrf_scan.scan import Floats, PairPrediction, ScanPair
 
 JOINT, EXACT = "joint", "joint, exact likelihood"
 LATTICE, LATTICE_EXACT = "joint, lattice", "joint, lattice, exact likelihood"
-HELD_ROUNDS = 10
+HELD_ROUNDS = 10  # of the model whose motions are given
 METHODS = (
     *("all background", "ICP", "ICP, tuned", *LIBRARIES, "trimmed ICP + RANSAC"),
     *("K-Means (ICP)", "K-Means (ICP), ego removed", "CRF-Matching"),
     *("K-Means (CRF-Matching)", "K-Means (CRF-Matching), ego removed", "CRF-Clustering", "start + gated NN"),
     *(JOINT, EXACT, LATTICE, LATTICE_EXACT, "joint, true motions", "joint, true associations"),
 )  # rows of every table, in this order
-
 
 _fitted_features: dict[str, tuple[JointScanCRF, Margins]] = {}  # of this process, by `features_key`
 
