@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -6,6 +8,8 @@ from hypothesis import strategies as st
 from support import assert_close
 
 from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference.uncertainty import Uncertainty
 from torchcrf_scan.scan import Annotation, Scan, ScanPair
 
 
@@ -59,6 +63,7 @@ def test_collate_tells_what_the_pair_tells() -> None:
     assert_close(batch.dt, [0.25, 0.1])
     assert_close(batch.range_noise[0], 0.03)
     assert_close(batch.initial_motion, torch.zeros(2, 3))
+    assert_close(batch.target_origin, torch.zeros(2, 2))
     assert batch.truth is None
     assert batch.source.dtype == batch.dt.dtype == batch.range_noise.dtype == torch.float32
 
@@ -170,6 +175,51 @@ def test_a_slice_is_a_batch() -> None:
         batch[0]
 
 
+def three_pairs() -> ScanPairBatch:
+    """Pairs of 1, 3 and 2 points that were seen from elsewhere, the third with a mover."""
+    pairs = [annotated([1.0] * n, [1.0 + n] * n, motions=np.full((1 + (n == 2), 3), 0.1 * n)) for n in (1, 3, 2)]
+    return ScanPairBatch.collate(pairs, torch.float64)
+
+
+OFFSET = torch.tensor([[0.4, 3.0, -1.0], [-3.0, 0.0, 2.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+
+
+def test_a_displaced_batch_is_the_same_scene() -> None:
+    batch = three_pairs()
+    moved = batch.displaced(OFFSET)
+    assert_close(moved.target_origin, OFFSET[:, 1:])
+    assert torch.equal(moved.source, batch.source)
+    assert torch.equal(moved.initial_motion, batch.initial_motion)
+    assert batch.truth is not None
+    assert moved.truth is not None
+    assert torch.equal(moved.truth.association, batch.truth.association)
+    for b, n in enumerate((1, 3, 2)):
+        assert_close(moved.target[b, :n], se2.apply(OFFSET[b], batch.target[b, :n]))
+        assert not moved.target[b, n:].any()  # the padding stays
+        assert_close(moved.truth.motions[b, 0], se2.compose(OFFSET[b], batch.truth.motions[b, 0]))
+    assert moved.truth.motions[:2, 1].isnan().all()
+    assert_close(moved.truth.motions[2], batch.truth.motions[2])
+    assert moved.without_truth().displaced(OFFSET).truth is None
+
+
+def test_displacing_back_is_no_displacement() -> None:
+    batch = three_pairs()
+    again = batch.displaced(OFFSET).displaced(se2.inverse(OFFSET))
+    assert again.truth is not None
+    assert batch.truth is not None
+    for name in ("target", "target_origin"):
+        assert_close(getattr(again, name), getattr(batch, name))
+    assert_close(again.truth.motions, batch.truth.motions)
+
+
+def test_the_origin_goes_where_the_batch_goes() -> None:
+    moved = three_pairs().displaced(OFFSET)
+    assert_close(moved.scaled(torch.tensor([2.0, 3.0, 4.0]).double()).target_origin, [[6.0, -2.0], [0.0, 6.0], [0.0, 0.0]])
+    assert_close(moved.select(torch.tensor([1, 0])).target_origin, OFFSET[[1, 0], 1:])
+    assert_close(moved[1:].target_origin, OFFSET[1:, 1:])
+    assert moved.to(torch.float32).target_origin.dtype == torch.float32
+
+
 def test_without_truth() -> None:
     batch = ScanPairBatch.collate([annotated([1.0], [1.0])])
     assert batch.without_truth().truth is None
@@ -236,6 +286,36 @@ def test_a_prediction_counts_beams() -> None:
         assert confidence.tolist() == pytest.approx([0.0, expected[0], expected[1], 0.0, expected[2]])
     assert answer.converged is True
     assert prediction.pair(0, pair).converged is False
+
+
+def test_the_certainty_is_numbered_like_the_motions() -> None:
+    prediction = make_prediction([0] * 6, [2, 3, 3, 2, 3, 0])
+    numbers = torch.arange(4.0)
+    uncertainty = Uncertainty(
+        covariance=(10 + numbers)[None, :, None, None].expand(2, 4, 3, 3),
+        information=torch.tensor([[1.0, 1, 1], [0, 1, 1], [0, 1, 1], [1, 1, 1]]).expand(2, 4, 3),
+        directions=torch.eye(3)[torch.tensor([[0, 1, 2], [0, 1, 2], [1, 0, 2], [0, 1, 2]])].expand(2, 4, 3, 3),
+    )
+    answer = replace(prediction, uncertainty=uncertainty).pair(1, make_pair(6, 6))
+    assert answer.motions[:, 0].tolist() == [0, 3, 2]
+    assert answer.covariances is not None
+    assert answer.unobserved_turn is not None
+    assert answer.unobserved_shift is not None
+    assert answer.covariances[:, 0, 0].tolist() == [10, 13, 12]
+    assert answer.covariances.shape == (3, 3, 3)
+    assert answer.unobserved_turn.tolist() == [False, False, False]
+    assert np.abs(answer.unobserved_shift).tolist() == [[0, 0], [0, 0], [1, 0]]
+    turned = replace(prediction, cluster=torch.where(prediction.cluster == 2, 1, prediction.cluster), uncertainty=uncertainty)
+    assert turned.pair(1, make_pair(6, 6)).unobserved_turn.tolist() == [False, False, True]  # type: ignore[union-attr]
+    assert prediction.pair(1, make_pair(6, 6)).covariances is None
+
+
+def test_given_confidences_win_over_beliefs() -> None:
+    prediction = make_prediction([0, 1], [0, 0])
+    sure = torch.tensor([[0.0, 0.0], [0.25, 0.75]])
+    answer = replace(prediction, association_confidence=sure, cluster_confidence=1 - sure).pair(1, make_pair(2, 2))
+    assert answer.association_confidence.tolist() == [0.25, 0.75]
+    assert answer.cluster_confidence.tolist() == [0.75, 0.25]
 
 
 def test_a_prediction_of_an_empty_scan() -> None:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
+
+if TYPE_CHECKING:
+    from torchcrf_scan.inference.uncertainty import Uncertainty
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +47,8 @@ class ScanPairBatch:
         range_noise: (B,) standard deviation of a return, metres; estimated from the scans where the sensor does not say.
         initial_motion: (B, 3) `T_target_source` guess (odometry); the identity where there is none.
         truth: the annotation, when every pair has one.
+        target_origin: (B, 2) where the sensor stood when it took the target, in the target's frame; 0 (and zeros if not given)
+            but where that frame was displaced.
     """
 
     source: Tensor
@@ -53,6 +61,11 @@ class ScanPairBatch:
     range_noise: Tensor
     initial_motion: Tensor
     truth: Truth | None = None
+    target_origin: Tensor = field(default=None)  # type: ignore[assignment]  # never None once made
+
+    def __post_init__(self) -> None:
+        if self.target_origin is None:
+            object.__setattr__(self, "target_origin", torch.zeros_like(self.initial_motion[:, 1:]))
 
     def __len__(self) -> int:
         return len(self.source)
@@ -97,6 +110,23 @@ class ScanPairBatch:
             target=self.target * by_pair,
             range_noise=self.range_noise * factor,
             initial_motion=scale_motions(self.initial_motion, factor),
+            target_origin=self.target_origin * factor[:, None],
+            truth=truth,
+        )
+
+    def displaced(self, offset: Tensor) -> ScanPairBatch:
+        """The same scenes with the target given in another frame, of which `initial_motion` knows nothing.
+
+        Args:
+            offset: (B, 3) motion of the target's points into the new frame.
+        """
+        truth = self.truth and replace(
+            self.truth, motions=se2.compose(offset[:, None].expand_as(self.truth.motions), self.truth.motions)
+        )
+        return replace(
+            self,
+            target=torch.where(self.target_mask[..., None], se2.apply(offset, self.target), self.target),
+            target_origin=se2.apply(offset, self.target_origin[:, None])[:, 0],
             truth=truth,
         )
 
@@ -121,6 +151,7 @@ class ScanPairBatch:
             dt=torch.tensor([pair.dt for pair in pairs], dtype=dtype),
             range_noise=torch.tensor([_range_noise(pair) for pair in pairs], dtype=dtype),
             initial_motion=torch.zeros(len(pairs), 3, dtype=dtype),
+            target_origin=torch.zeros(len(pairs), 2, dtype=dtype),
             truth=_collate_truth(pairs, source_mask, dtype) if all(pair.annotation for pair in pairs) else None,
         )
 
@@ -185,6 +216,9 @@ class Prediction:
         log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier.
         converged: (B,) bool, whether labels and motions had settled.
         iterations: (B,) int64 rounds done.
+        association_confidence: (B, N) in [0, 1], to be right within two target points; calibrated. None: the beliefs themselves.
+        cluster_confidence: (B, N) in [0, 1], calibrated. None: the beliefs themselves.
+        uncertainty: covariances of the motions and what of them was not observed; None for methods that do not say.
     """
 
     association: Tensor
@@ -196,6 +230,9 @@ class Prediction:
     log_cluster: Tensor
     converged: Tensor
     iterations: Tensor
+    association_confidence: Tensor | None = None
+    cluster_confidence: Tensor | None = None
+    uncertainty: Uncertainty | None = None
 
     def pair(self, b: int, pair: ScanPair) -> PairPrediction:
         """Pair b by beam, its movers numbered 1.. by falling size, the vacuous ones left out."""
@@ -207,14 +244,24 @@ class Prediction:
         number = np.full(len(motions) + 1, -1)  # the last entry keeps -1 at -1
         number[[0, *movers]] = np.arange(len(movers) + 1)
         beam_of_point = np.append(pair.target.beam, -1)
-        confidences = [
-            log.detach()[b, :n].exp().amax(-1).cpu().double().numpy() for log in (self.log_association, self.log_cluster)
-        ]
+        rows = [0, *movers]
+        given = (self.association_confidence, self.log_association), (self.cluster_confidence, self.log_cluster)
+        confidences = [(log.exp().amax(-1) if sure is None else sure)[b, :n].detach().cpu().double().numpy() for sure, log in given]
+
+        def of_clusters(values: Tensor) -> NDArray[Any]:
+            return values[b].detach().cpu().numpy()[rows]
+
+        certainty = {}
+        if self.uncertainty is not None:
+            certainty["covariances"] = of_clusters(self.uncertainty.covariance.double())
+            certainty["unobserved_turn"] = of_clusters(self.uncertainty.is_turn_unobserved)
+            certainty["unobserved_shift"] = of_clusters(self.uncertainty.unobserved_shift.double())
         return PairPrediction(
             association=pair.source.to_beams(beam_of_point[association], -1),
             cluster=pair.source.to_beams(number[cluster], -1),
-            motions=motions[[0, *movers]],
+            motions=motions[rows],
             association_confidence=pair.source.to_beams(confidences[0], 0.0),
             cluster_confidence=pair.source.to_beams(confidences[1], 0.0),
             converged=bool(self.converged[b]),
+            **certainty,
         )

@@ -10,11 +10,19 @@ from torch import Tensor
 
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
-from torchcrf_scan.inference.registration import gauss_newton_step, nearest_points, register
+from torchcrf_scan.inference.registration import (
+    ROUGHNESS,
+    gauss_newton_step,
+    nearest_points,
+    register,
+    register_both,
+    surface_residual,
+)
 from torchcrf_scan.inference.surface import Surface
 
 SEEDS = st.integers(0, 10_000)
 STILL = torch.zeros(1, 3, dtype=torch.float64)
+NOISE = torch.tensor(0.01, dtype=torch.float64)
 GATES, ALONG = [0.6, 0.6, 0.4, 0.3, 0.2, 0.2, 0.2, 0.2], [1.0, 1.0, 0.5, 0.5, 0.1, 0.1, 0.1, 0.1]
 
 
@@ -46,6 +54,32 @@ def test_nearest_points(P: int, M: int, seed: int) -> None:
         apart = [math.dist(moved[h, i].tolist(), q) for q in target.tolist()]
         assert_close(distance[h, i], min(apart))
         assert index[h, i].item() == apart.index(min(apart))
+
+
+def straight_wall() -> Surface:
+    """Returns every 0.2 m from y = -2 to 2."""
+    y = torch.linspace(-2.0, 2.0, 21, dtype=torch.float64)
+    return Surface.of(torch.stack([torch.full_like(y, 4.0), y], -1), NOISE, False)
+
+
+@given(st.floats(-1.5, 1.5), st.floats(-0.3, 0.3))
+def test_a_surface_goes_on_between_its_returns(along: float, across: float) -> None:
+    wall = straight_wall()
+    residual, index = surface_residual(torch.tensor([[4.0 + across, along]], dtype=torch.float64), wall)
+    assert_close(residual, [abs(across) / (ROUGHNESS * 0.2 + 0.02)], tolerance=1e-6)
+    assert abs(float(wall.points[index, 1]) - along) <= 0.1 + 1e-9
+
+
+def test_a_surface_ends_half_a_spacing_beyond_its_last_return() -> None:
+    wall = straight_wall()
+    residual, _ = surface_residual(torch.tensor([[4.0, 2.5], [4.3, 2.5]], dtype=torch.float64), wall)
+    assert_close(residual, [0.4 / 0.04, 0.5 / 0.04], tolerance=1e-6)
+
+
+def test_a_lonely_return_has_no_direction() -> None:
+    pole = Surface.of(torch.tensor([[4.0, 0.0]]).double(), NOISE, False)
+    residual, _ = surface_residual(torch.tensor([[4.0, 0.3], [4.3, 0.0]], dtype=torch.float64), pole)
+    assert_close(residual, [0.3 / (float(pole.spacing) / 2 + 0.02)] * 2)
 
 
 # One step.
@@ -157,3 +191,17 @@ def test_gates_and_slacks_come_in_pairs() -> None:
     source, target = see_corner(torch.zeros(3).double()), corner(torch.zeros(3).double())
     with pytest.raises(ValueError, match="zip"):
         register(source, torch.ones(len(source)).double(), target, STILL, [0.1], [])
+
+
+@given(st.floats(-0.03, 0.03), st.floats(-0.08, 0.08), st.floats(-0.08, 0.08))
+@settings(max_examples=20)
+def test_both_scans_on_each_other(theta: float, tx: float, ty: float) -> None:
+    motion = torch.tensor([theta, tx, ty], dtype=torch.float64)
+    source, target = corner(torch.zeros(3).double()), corner(motion)
+    gates, along = [5.0, 4.0, 3.0, 2.0, 2.0, 2.0, 2.0, 2.0], [0.5, 0.3, 0.1, 0.1, 0.03, 0.03, 0.03, 0.03]
+    there = register_both(source, target, STILL, gates, along)
+    rotation, translation = se2.distance(there[0], motion)
+    assert float(rotation) < 2e-3
+    assert float(translation) < 5e-3
+    back = register_both(target, source, STILL, gates, along)
+    assert_close(se2.inverse(back), there, tolerance=5e-3)  # neither scan is the first one

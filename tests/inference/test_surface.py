@@ -156,6 +156,21 @@ def test_a_turned_sensor_sees_the_same_segments(theta: float, n: int, seed: int)
     assert_close(turned.spacing, found.spacing)
 
 
+@given(st.floats(-3, 3), st.floats(-20, 20), st.floats(-20, 20), st.integers(2, 60), st.booleans(), st.integers(0, 10_000))
+@settings(max_examples=25)
+def test_a_scan_in_another_frame_is_the_same_scan(theta: float, x: float, y: float, n: int, closed: bool, seed: int) -> None:
+    points = polar(4 + make_points(n, seed)[:, 0] / 6, degrees(-120, 120, n))
+    offset = torch.tensor([theta, x, y], dtype=torch.float64)
+    here, there = (Surface.of(p, NOISE, closed, o) for p, o in ((points, None), (se2.apply(offset, points), offset[1:])))
+    assert torch.equal(there.segment, here.segment)
+    for name in ("ranges", "spacing", "length", "step"):
+        assert_close(getattr(there, name), getattr(here, name))
+    assert_close(there.tangent, se2.rotate(offset[0], here.tangent))
+    assert_close(se2.wrap(there.bearings - here.bearings - theta), torch.zeros(n))
+    moved = 5 * normal(30, 2, seed=seed)
+    assert verdicts(look_along(se2.apply(offset, moved), there)) == verdicts(look_along(moved, here))
+
+
 # Free space. A wall 5 m ahead with a doorway; through it, a wall 10 m ahead.
 
 BEARINGS = degrees(-40, 40, 321)

@@ -8,15 +8,22 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.registration import nearest_points, register
+from torchcrf_scan.inference.registration import register, register_both, surface_residual
 from torchcrf_scan.inference.surface import Surface, carry_back, look_along
 
 COARSE_POINTS = 120
-KEPT = 10  # hypotheses worth a refinement
+SEGMENT_POINTS = 24
+COARSE = 6  # hypotheses of the coarse search that are kept; the segments are registered from the best three
+SLIDES = 10  # steps each way along the walls, for all of them
+SLIDE_STEP = 4.0  # units
+SLID = 6  # kept of these
+KEPT = 12  # so many of all are worth a polish,
+REFINED = 5  # and so many of the polished ones a refinement
 TRUNCATION = 3.0  # a residual of three units is as bad as any
 CONTRADICTION = 3.0  # units charged for a point that the other scan sees through (design finding 17)
 UNSEEN = 1.5  # units charged for a point of which the other scan says nothing; else flying off the map would be free
-LENGTH_SHARE = (0.25, 4.0)  # a point stands for at least, at most this many median lengths of surface
+LENGTH_SHARE = (0.25, 4.0)  # median lengths of surface that a point stands for at least and at most, where it pulls,
+COST_SHARE = (0.1, 10.0)  # and where motions are compared
 
 
 def unit_length(source: Surface, target: Surface) -> Tensor:
@@ -24,32 +31,42 @@ def unit_length(source: Surface, target: Surface) -> Tensor:
     return torch.cat([source.spacing, target.spacing]).median() / 2 + 2 * torch.maximum(source.noise, target.noise)
 
 
-def _one_way(moved: Tensor, surface: Surface, other: Surface) -> Tensor:
-    """(H,) truncated residual of `surface`'s points, carried to (H, P, 2), in the other scan; per length, see-through charged."""
-    distance, index = nearest_points(moved, other)
-    unit = other.spacing[index] / 2 + 2 * other.noise
-    residual = (distance / unit).clamp(max=TRUNCATION)
+def _share(length: Tensor, low: float, high: float) -> Tensor:
+    """(P,) metres of surface in units of their median, clipped."""
+    return (length / length.median().clamp(min=1e-6)).clamp(low, high)
+
+
+def _one_way(moved: Tensor, length: Tensor, other: Surface, slack: float) -> Tensor:
+    """(H,) truncated residual of (H, P, 2) moved points, standing for (P,) lengths, in the other scan; see-through charged."""
+    residual = (surface_residual(moved, other)[0] / slack).clamp(max=TRUNCATION)
     sight = look_along(moved, other)
-    usual = surface.length.median()
-    length = (surface.length / usual.clamp(min=1e-6)).clamp(*LENGTH_SHARE)
-    counted = ~(sight.occluded | sight.unmeasured) | (residual < TRUNCATION)
-    unexplained = torch.where(sight.seen_through & (residual >= TRUNCATION), CONTRADICTION, 0.0) + residual
-    return (length * torch.where(counted, unexplained, UNSEEN)).sum(-1) / length.sum()
+    is_far = residual >= TRUNCATION
+    left_open = torch.where(sight.seen_through & is_far, CONTRADICTION, 0.0) + residual
+    left_open = torch.where((sight.occluded | sight.unmeasured) & is_far, UNSEEN, left_open)
+    share = _share(length, *COST_SHARE)
+    return (share * left_open).sum(-1) / share.sum()
 
 
-def background_cost(motions: Tensor, source: Surface, target: Surface) -> Tensor:
-    """(H,) what every motion leaves unexplained when the whole scene is taken as static, both ways (design finding 17)."""
-    forward = _one_way(se2.apply(motions, source.points), source, target)
-    return forward + _one_way(carry_back(motions, target.points), target, source)
+def background_cost(motions: Tensor, source: Surface, target: Surface, most: int | None = None, slack: float = 1.0) -> Tensor:
+    """(H,) what every motion leaves unexplained when the whole scene is taken as static, both ways (design finding 17).
+
+    Args:
+        most: about so many points of either scan are looked at, None: all.
+        slack: factor on what counts as one unit of residual, for motions that are not registered yet.
+    """
+    ahead, behind = (slice(None, None, max(1, math.ceil(len(scan) / (most or len(scan))))) for scan in (source, target))
+    forward = _one_way(se2.apply(motions, source.points[ahead]), source.length[ahead], target, slack)
+    return forward + _one_way(carry_back(motions, target.points[behind]), target.length[behind], source, slack)
 
 
-def start_grid(source: Surface, target: Surface, guess: Tensor) -> Tensor:
-    """(H, 3) starts round the guess: turns and shifts in shares of the scene's size."""
+def start_grid(source: Surface, target: Surface) -> Tensor:
+    """(H, 3) turns and shifts in shares of the scene's size."""
     reach = 0.12 * torch.cat([source.ranges, target.ranges]).median()
     turns = torch.tensor([0.0, 0.12, -0.12, 0.3, -0.3])
     shifts = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [2.5, 0.0], [-2.5, 0.0]])
-    grid = torch.cat([turns.repeat_interleave(len(shifts))[:, None], shifts.repeat(len(turns), 1) * reach.cpu()], dim=1)
-    return se2.compose(grid.to(guess), guess.expand(len(grid), 3))
+    return torch.cat([turns.repeat_interleave(len(shifts))[:, None], shifts.repeat(len(turns), 1) * reach.cpu()], 1).to(
+        source.points
+    )
 
 
 def distinct(motions: Tensor, cost: Tensor, near: Tensor, count: int) -> Tensor:
@@ -67,26 +84,46 @@ def distinct(motions: Tensor, cost: Tensor, near: Tensor, count: int) -> Tensor:
 
 
 def background_pool(source: Surface, target: Surface, guess: Tensor, extra: Tensor | None = None) -> Tensor:
-    """(H, 3) refined hypotheses of the background's motion, cheapest first."""
+    """(H, 3) hypotheses of the background's motion, cheapest first.
+
+    Every stage's motions stay in the pool: where a mover supplies most returns, the next stage may lead away from the truth.
+
+    Args:
+        guess: (3,) one more place to search from, and one more hypothesis; so is the identity. extra: (H, 3) more starts.
+    """
     unit = unit_length(source, target)
-    u = float(unit)
-    stride = max(1, math.ceil(len(source) / COARSE_POINTS))
-    coarse = source.points[::stride]
-    weights = source.length[::stride].clamp(min=float(source.length.median()) / 4, max=float(source.length.median()) * 4)
-    starts = start_grid(source, target, guess)
-    if extra is not None:
-        starts = torch.cat([starts, extra])
-    pool = register(
-        coarse, weights, target, starts, [8 * u, 8 * u, 6 * u, 6 * u, 4 * u, 4 * u, 3 * u, 2 * u], [1.0] * 4 + [0.3] * 4
-    )
-    cost = background_cost(pool, source, target)
-    pool = pool[distinct(pool, cost, unit, 6)]
-    by_segment = segment_hypotheses(source, target, pool[:3], u)
-    pool = torch.cat([pool, by_segment])
+    grid = start_grid(source, target)
+    guesses = torch.stack([torch.zeros_like(guess), guess]) if guess.any() else guess[None]
+    given = guesses if extra is None else torch.cat([guesses, extra])
+    starts = se2.compose(grid.repeat(len(guesses), 1), guesses.repeat_interleave(len(grid), 0))
+    coarse = search_coarsely(torch.cat([starts, given]), source, target, float(unit))
+    coarse = coarse[distinct(coarse, background_cost(coarse, source, target, most=COARSE_POINTS), unit, COARSE)]
+    slid = slide(torch.cat([coarse, guesses]), target, unit)
+    slid = slid[distinct(slid, background_cost(slid, source, target, most=COARSE_POINTS, slack=SLIDE_STEP), unit, SLID)]
+    pool = torch.cat([coarse, given, slid, segment_hypotheses(source, target, coarse[:3], float(unit))])
     pool = pool[distinct(pool, background_cost(pool, source, target), unit, KEPT)]
-    pool = refine(polish(pool, source, target, u), source, target, u)
+    pool = torch.cat([pool, polish(pool, source, target, float(unit))])
     cost = background_cost(pool, source, target)
+    refined = refine(pool[distinct(pool, cost, unit / 2, REFINED)], source, target)
+    pool, cost = torch.cat([pool, refined]), torch.cat([cost, background_cost(refined, source, target)])
     return pool[distinct(pool, cost, unit / 2, len(pool))]
+
+
+def search_coarsely(motions: Tensor, source: Surface, target: Surface, unit: float) -> Tensor:
+    """Registers some of the source's points from afar."""
+    some = slice(None, None, math.ceil(len(source) / COARSE_POINTS))
+    gates, along = [unit * gate for gate in (8.0, 8.0, 6.0, 6.0, 4.0, 4.0, 3.0, 2.0)], [1.0] * 4 + [0.3] * 4
+    return register(source.points[some], _share(source.length, *LENGTH_SHARE)[some], target, motions, gates, along)
+
+
+def slide(motions: Tensor, target: Surface, unit: Tensor) -> Tensor:
+    """(H S, 3) motions displaced along the way that most of the target's surface runs: there, registration is slow or blind."""
+    x, y = target.tangent.unbind(-1)
+    heading = torch.atan2((2 * x * y).sum(), (x**2 - y**2).sum()) / 2  # the mean of axes, which have no sign
+    steps = torch.arange(-SLIDES, SLIDES + 1, device=motions.device)
+    shift = (SLIDE_STEP * unit * steps[steps != 0])[:, None] * torch.stack([heading.cos(), heading.sin()])  # (S, 2)
+    turn = motions[:, None, :1].expand(-1, len(shift), 1)
+    return torch.cat([turn, motions[:, None, 1:] + shift], dim=-1).flatten(0, 1)
 
 
 def segment_hypotheses(source: Surface, target: Surface, motions: Tensor, unit: float, smallest: int = 6, most: int = 12) -> Tensor:
@@ -94,23 +131,20 @@ def segment_hypotheses(source: Surface, target: Surface, motions: Tensor, unit: 
     sizes = torch.bincount(source.segment)
     large = sizes.argsort(descending=True)[:most]
     large = large[sizes[large] >= smallest]
-    membership = (source.segment[None] == large[:, None]).to(source.points)  # (S, P)
+    members = (source.segment[None] == large[:, None]).sort(descending=True, stable=True).indices  # (S, P), members come first
+    spread = torch.arange(SEGMENT_POINTS, device=members.device) * sizes[large, None] // SEGMENT_POINTS  # (S, L)
+    points = source.points[members.gather(1, spread)].repeat_interleave(len(motions), 0)  # (S H, L, 2)
     starts = motions.repeat(len(large), 1)
-    weights = membership.repeat_interleave(len(motions), 0)
-    return register(source.points, weights, target, starts, [6 * unit, 4 * unit, 3 * unit, 2 * unit], [1.0, 1.0, 0.3, 0.3])
-
-
-def refine(motions: Tensor, source: Surface, target: Surface, unit: float) -> Tensor:
-    """Point-to-line registration of the whole scan from good starts: the mean of source on target and target on source."""
-    gates, along = [unit * g for g in (2.0, 1.5, 1.0, 1.0, 1.0, 1.0)], [0.03] * 6
-    forward = register(source.points, torch.ones_like(source.ranges), target, motions, gates, along)
-    backward = se2.inverse(register(target.points, torch.ones_like(target.ranges), source, se2.inverse(motions), gates, along))
-    halfway = torch.cat([se2.wrap(backward[..., :1] - forward[..., :1]), backward[..., 1:] - forward[..., 1:]], dim=-1) / 2
-    return forward + halfway
+    gates = [unit * gate for gate in (6.0, 4.0, 3.0, 2.0)]
+    return register(points, torch.ones_like(points[..., 0]), target, starts, gates, [1.0, 1.0, 0.3, 0.3])
 
 
 def polish(motions: Tensor, source: Surface, target: Surface, unit: float) -> Tensor:
     """Draws hypotheses that are still a few gates off to where `refine` can take over."""
-    usual = float(source.length.median())
-    weights = source.length.clamp(min=usual / 4, max=usual * 4)
-    return register(source.points, weights, target, motions, [4 * unit, 3 * unit, 2 * unit, 1.5 * unit], [0.1] * 4)
+    gates = [unit * gate for gate in (4.0, 3.0, 2.0, 1.5)]
+    return register(source.points, _share(source.length, *LENGTH_SHARE), target, motions, gates, [0.1] * 4)
+
+
+def refine(motions: Tensor, source: Surface, target: Surface) -> Tensor:
+    """Point-to-line registration of the whole scans on each other, from good starts, by the residual that the choice goes by."""
+    return register_both(source, target, motions, [3.0, 2.0, 2.0, 1.5, 1.5, 1.5], [0.03] * 6)

@@ -26,7 +26,9 @@ class Surface:
     """A scan of P points with its geometry.
 
     Attributes:
-        points: (P, 2), ranges: (P,), bearings: (P,).
+        points: (P, 2).
+        origin: (2,) where the sensor stood, in the frame of the points.
+        ranges: (P,), bearings: (P,) of the points, as seen from there.
         spacing: (P,) metres to the next point of the same surface; what a beam step covers where there is none.
         tangent: (P, 2) unit vector along the surface, 0 for a lonely point.
         length: (P,) metres of surface that the point stands for.
@@ -38,6 +40,7 @@ class Surface:
     """
 
     points: Tensor
+    origin: Tensor
     ranges: Tensor
     bearings: Tensor
     spacing: Tensor
@@ -50,12 +53,13 @@ class Surface:
     tree: cKDTree
 
     @classmethod
-    def of(cls, points: Tensor, noise: Tensor, is_closed: bool) -> Surface:
-        """points: (P, 2) in beam order, P >= 1; noise: () metres."""
+    def of(cls, points: Tensor, noise: Tensor, is_closed: bool, origin: Tensor | None = None) -> Surface:
+        """points: (P, 2) in beam order, P >= 1; noise: () metres; origin: (2,) of the sensor, None: the origin of the frame."""
         from scipy.spatial import cKDTree
 
-        ranges = torch.linalg.vector_norm(points, dim=-1)
-        bearings = _unwrapped_bearings(points)
+        origin = torch.zeros_like(points[0]) if origin is None else origin
+        ranges, bearings = _look_from(origin, points)
+        bearings = torch.cat([bearings[:1], _turn(bearings.diff())]).cumsum(0)  # rising through the scan
         following = points.roll(-1, 0) - points  # (P, 2), the last one leads round
         gap = torch.linalg.vector_norm(following, dim=-1)
         turn = _turn(bearings.roll(-1, 0) - bearings)
@@ -72,6 +76,7 @@ class Surface:
         arm_length = torch.linalg.vector_norm(arm, dim=-1, keepdim=True)
         return cls(
             points=points,
+            origin=origin,
             ranges=ranges,
             bearings=bearings,
             spacing=spacing,
@@ -88,10 +93,10 @@ class Surface:
         return len(self.points)
 
 
-def _unwrapped_bearings(points: Tensor) -> Tensor:
-    """(P,) bearings of points in beam order, rising through the scan."""
-    bearing = torch.atan2(points[:, 1], points[:, 0])
-    return torch.cat([bearing[:1], _turn(bearing.diff())]).cumsum(0)
+def _look_from(origin: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """(...,) ranges and bearings of (..., 2) points as seen from (2,)."""
+    ray = points - origin
+    return torch.linalg.vector_norm(ray, dim=-1), torch.atan2(ray[..., 1], ray[..., 0])
 
 
 def _turn(difference: Tensor) -> Tensor:
@@ -132,9 +137,9 @@ def look_along(moved: Tensor, scan: Surface, margin: float = 3.0) -> Sight:
         moved: (..., P, 2).
         margin: slack in units of spacing and noise.
     """
-    ranges = torch.linalg.vector_norm(moved, dim=-1)
+    ranges, bearings = _look_from(scan.origin, moved)
     first, half_step = scan.bearings[0], scan.step / 2
-    bearings = first + (torch.atan2(moved[..., 1], moved[..., 0]) - first + half_step) % (2 * math.pi) - half_step
+    bearings = first + (bearings - first + half_step) % (2 * math.pi) - half_step
     after = torch.searchsorted(scan.bearings, bearings.contiguous())
     M = len(scan)
     inside = bearings <= scan.bearings[-1] + half_step
