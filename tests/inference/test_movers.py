@@ -11,9 +11,16 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
 from torchcrf_scan.inference.hypothesis_features import FEATURES, hypothesis_features
-from torchcrf_scan.inference.movers import HypothesisScore, Movers, find_movers, select
+from torchcrf_scan.inference.movers import PRODUCTS, HypothesisScore, Movers, find_movers, select
 from torchcrf_scan.inference.surface import Surface
-from torchcrf_scan.learning.hypothesis_fit import IGNORED, fit_hypothesis_score, label_hypotheses, simulate_mixture, view_pair
+from torchcrf_scan.learning.hypothesis_fit import (
+    IGNORED,
+    fit_hypothesis_score,
+    fit_mixture,
+    label_hypotheses,
+    simulate_mixture,
+    view_pair,
+)
 from torchcrf_scan.scan import ScanPair
 
 NOISE = torch.tensor(0.01)
@@ -57,10 +64,10 @@ def movers_of(source: Surface, target: Surface, background: Tensor, dt: float, s
     return find_movers(hypotheses, hypothesis_features(hypotheses, source, target, background), source, target, score)
 
 
-def scene(moving: tuple[str, ...] = ("ahead", "across")) -> tuple[Surface, Surface]:
+def scene(moving: tuple[str, ...] = ("ahead", "across"), steps: dict[str, Tensor] = STEPS) -> tuple[Surface, Surface]:
     source, target = list(WALLS), carried(WALLS, EGO)
     for name, segments in BOXES.items():
-        step = STEPS[name] if name in moving else torch.zeros(3)
+        step = steps[name] if name in moving else torch.zeros(3)
         source += segments
         target += carried(segments, se2.compose(EGO, step))
     return Surface.of(cast(source, 1), NOISE, False), Surface.of(cast(target, 2), NOISE, False)
@@ -103,6 +110,25 @@ def test_two_objects_are_found_and_nothing_else() -> None:
     assert len(movers.motions) == 2
     assert_found(movers.motions, source, {name: se2.compose(EGO, step) for name, step in STEPS.items()}, 0.1)
     assert (movers.probabilities.diff() <= 0).all()
+
+
+def test_two_objects_of_one_motion_far_apart_are_two() -> None:
+    alike = dict.fromkeys(BOXES, torch.tensor([0.0, 1.1, 0.1]))
+    source, target = scene(steps=alike)
+    movers = movers_of(source, target, EGO, DT, HypothesisScore())
+    assert_found(movers.motions, source, {name: se2.compose(EGO, step) for name, step in alike.items()}, 0.1)
+    for name in BOXES:
+        assert (movers.members & in_box(source.points, name)).any(-1).sum() == 1, name
+
+
+def test_one_motion_of_two_parts_of_an_object_is_accepted_once() -> None:
+    source, target = scene()
+    motion = se2.compose(EGO, STEPS["ahead"])
+    car = in_box(source.points, "ahead").nonzero()[:, 0]
+    members = torch.zeros(2, len(source), dtype=torch.bool)
+    members[0, car[::2]] = members[1, car[1::2]] = True
+    movers = select(Hypotheses(motion.expand(2, 3), members), torch.tensor([0.8, 0.9]), source, target, threshold=0.5, most=6)
+    assert torch.equal(movers.members, members[1:])
 
 
 def test_what_stands_still_is_no_mover() -> None:
@@ -215,6 +241,33 @@ def test_labels_of_hypotheses() -> None:
     assert label_hypotheses(pool, source, body, lost, torch.tensor(0.1)).tolist() == [-1, -1, 0, 0]
     body[car] = IGNORED
     assert label_hypotheses(pool, source, body, motions, torch.tensor(0.1)).tolist() == [-1, -1, 0, 0]
+
+
+def test_far_points_tell_less_of_a_motion() -> None:
+    """The same error is right on coarse surface and wrong on fine."""
+    source, _ = scene()
+    car = in_box(source.points, "ahead")
+    body = car.long()
+    motions = torch.stack([EGO, se2.compose(EGO, STEPS["ahead"])])
+    off = motions[1:] + torch.tensor([0.0, 0.25, 0.0])
+    coarse = replace(source, spacing=source.spacing + 0.6)
+    labels = [label_hypotheses(Hypotheses(off, car[None]), s, body, motions, torch.tensor(0.1)).item() for s in (source, coarse)]
+    assert labels == [0, 1]
+
+
+def test_the_mixture_gives_a_score() -> None:
+    score = fit_mixture(5, seed=3)
+    assert all(value.isfinite().all() for value in score.buffers())
+    assert not torch.equal(score.weight, HypothesisScore().weight)
+
+
+def test_products_are_terms_of_the_score() -> None:
+    score = HypothesisScore()
+    features = torch.randn(5, len(FEATURES))
+    terms = score.terms(features)
+    assert terms.shape == (5, 2 * len(FEATURES) + len(PRODUCTS)) == (5, len(score.weight))
+    one, other = (FEATURES.index(name) for name in next(iter(PRODUCTS)))
+    torch.testing.assert_close(terms[:, 2 * len(FEATURES)], terms[:, one] * terms[:, other])
 
 
 def test_the_fit_keeps_the_default_without_movers() -> None:

@@ -19,12 +19,14 @@ from torchcrf_scan.inference.surface import Sight, Surface, look_along
 TRUNCATION = 3.0  # a residual of three units is as bad as any
 OPEN = 1.5  # units from which a point is not explained
 MIN_POINTS = 3
+PIECE_GAP = 2.5  # beam spacings from which two neighbours on a segment may be two objects
+LIFTED = 0.9  # units, mean residual from which a piece may have moved although none of its points is open
 SEGMENT_GAP = 8.0  # two unexplained segments this many spacings apart may be one object, seen with a beam missing
 FASTEST = 45.0  # metres per second; no road vehicle moves more per second
 FARTHEST = 1.0  # nor farther than this share of its range
 SCREEN_POINTS = 8  # of a segment, to compare starts
-STARTS = 6  # of a segment, to register
-REGISTER_POINTS = 24
+STARTS = 5  # of a segment, to register
+REGISTER_POINTS = 16
 USUAL_TURN = 0.1  # radians, standard deviation of a mover's turn between two scans
 
 
@@ -89,7 +91,7 @@ def hypothesise(source: Surface, target: Surface, background: Tensor, dt: float)
     if min(len(source), len(target)) < MIN_POINTS:
         return Hypotheses(background.new_zeros(0, 3), torch.zeros(0, len(source), dtype=torch.bool, device=background.device))
     leftover = Leftover.of(source, target, background)
-    groups, landing = _groups(source, leftover.source >= OPEN), _groups(target, leftover.target >= OPEN)
+    groups, landing = _groups(source, leftover.source), _groups(target, leftover.target)
     if not len(groups):
         return Hypotheses(background.new_zeros(0, 3), groups)
     shift = _shifts(se2.apply(background, source.points), groups, target, landing, dt)  # (S, A, 2)
@@ -97,20 +99,58 @@ def hypothesise(source: Surface, target: Surface, background: Tensor, dt: float)
     added = torch.cat([torch.zeros_like(shift[..., :1]), shift], dim=-1)
     motions = se2.compose(added, background.expand_as(added))  # (S, K, 3)
     which, start = shift.isfinite().all(-1).nonzero(as_tuple=True)
-    return _settle(motions[which, start], groups[which], source, target, background)
+    return Hypotheses(_settle(motions[which, start], groups[which], source, target, background), groups[which])
 
 
-def _groups(surface: Surface, is_open: Tensor) -> Tensor:
-    """(S, P) bool: segments with unexplained points, the unexplained part of each, and neighbours joined."""
-    count = int(surface.segment.max()) + 1
-    members = surface.segment[None] == torch.arange(count, device=is_open.device)[:, None]
-    members = members[(members & is_open).any(-1)]
-    parts = members & is_open  # an object before a wall may share its segment
-    is_part = (parts.sum(-1) >= MIN_POINTS) & (parts.sum(-1) < 0.7 * members.sum(-1))
-    pairs = members | members.roll(-1, 0)
-    pairs = pairs[_are_near(surface, members)]
-    groups = torch.cat([members, parts[is_part], pairs])
-    return groups[groups.sum(-1) >= MIN_POINTS]
+def _groups(surface: Surface, residual: Tensor) -> Tensor:
+    """(S, P) bool: what may be one object: segments and pieces, alone and two neighbours at a time, and unexplained parts and runs.
+
+    residual: (P,) units that the background leaves.
+    """
+    is_open = residual >= OPEN
+    segments, runs = _holding(surface.segment, is_open), _holding(_number(_are_joined(surface, is_open)), is_open)
+    piece = pieces(surface)
+    usual = torch.zeros_like(residual).scatter_reduce(0, piece, residual, "mean", include_self=False)
+    whole = _holding(piece, is_open | (usual >= LIFTED)[piece])
+    parts = segments & is_open  # an object before a wall may share its segment
+    is_part = parts.sum(-1) < 0.7 * segments.sum(-1)
+    groups = torch.cat([segments, whole, parts[is_part], runs, _neighbours(surface, segments), _neighbours(surface, whole)])
+    groups = groups[groups.sum(-1) >= MIN_POINTS]
+    return groups.unique(dim=0) if len(groups) else groups
+
+
+def _holding(number: Tensor, is_open: Tensor) -> Tensor:
+    """(S, P) bool: the segments that hold a point of a kind. number: (P,) segment of every point."""
+    return number == number[is_open].unique()[:, None]
+
+
+def pieces(surface: Surface) -> Tensor:
+    """(P,) number of every point's piece: segments, cut where neighbours lie far apart for a surface met at no flat angle.
+
+    Far away, the gap that a segment may have is as wide as a car's distance from the wall behind it.
+    """
+    gap = torch.linalg.vector_norm(surface.points.roll(-1, 0) - surface.points, dim=-1)
+    return _number(_are_joined(surface) & (gap <= PIECE_GAP * surface.ranges * surface.step + 6 * surface.noise))
+
+
+def _are_joined(surface: Surface, kind: Tensor | None = None) -> Tensor:
+    """(P,) bool: a point and the next one lie on one segment and are of one kind (P,)."""
+    joined = surface.segment == surface.segment.roll(-1)
+    if kind is not None:
+        joined &= kind == kind.roll(-1)
+    joined[-1] &= surface.is_closed
+    return joined
+
+
+def _number(joined: Tensor) -> Tensor:
+    """(P,) numbers from 0; joined[i] says that points i and i + 1 have the same."""
+    number = torch.cat([joined.new_zeros(1, dtype=torch.int64), (~joined[:-1]).long().cumsum(0)])
+    return torch.where(number == number[-1], 0, number) if bool(joined[-1]) else number
+
+
+def _neighbours(surface: Surface, members: Tensor) -> Tensor:
+    """(S', P) bool: every listed segment together with the next one, where they are near."""
+    return (members | members.roll(-1, 0))[_are_near(surface, members)]
 
 
 def _are_near(surface: Surface, members: Tensor) -> Tensor:
@@ -129,12 +169,17 @@ def landmarks(points: Tensor, members: Tensor) -> Tensor:
     """(S, 3, 2): centroid, first and last point of every segment, also of one that leads round the seam of a closed scan."""
     weights = members.to(points)
     centroid = weights @ points / weights.sum(-1, keepdim=True).clamp(min=1)
-    order = torch.arange(len(points), device=points.device)
-    is_round = (members[:, 0] & members[:, -1])[:, None]
-    order = torch.where(is_round, (order + len(points) // 2) % len(points), order)  # (S, P)
-    first = torch.where(members, order, len(points)).argmin(-1)
-    last = torch.where(members, order, -1).argmax(-1)
+    first, last = ends(members)
     return torch.stack([centroid, points[first], points[last]], dim=1)
+
+
+def ends(members: Tensor) -> tuple[Tensor, Tensor]:
+    """(S,) index of the first and of the last member, also of a set that leads round the seam of a closed scan. members: (S, P)."""
+    count = members.shape[-1]
+    order = torch.arange(count, device=members.device)
+    is_round = (members[:, 0] & members[:, -1])[:, None]
+    order = torch.where(is_round, (order + count // 2) % count, order)  # (S, P)
+    return torch.where(members, order, count).argmin(-1), torch.where(members, order, -1).argmax(-1)
 
 
 def _shifts(carried: Tensor, groups: Tensor, target: Surface, landing: Tensor, dt: float) -> Tensor:
@@ -175,14 +220,14 @@ def _screen(shift: Tensor, source: Surface, groups: Tensor, target: Surface, bac
     return torch.cat(kept, dim=1)
 
 
-def _settle(motions: Tensor, members: Tensor, source: Surface, target: Surface, background: Tensor) -> Hypotheses:
-    """Registers every start; few points say little of a turn."""
+def _settle(motions: Tensor, members: Tensor, source: Surface, target: Surface, background: Tensor) -> Tensor:
+    """(H, 3) registers every start; few points say little of a turn."""
     index, is_member = pick_members(members, REGISTER_POINTS)
     points, weights = source.points[index], is_member.to(source.points)
     unit = float(unit_length(source, target))
     gates, along = [unit * gate for gate in (4.0, 3.0, 2.0, 2.0, 1.5, 1.5)], [1.0, 1.0, 0.5, 0.5, 0.2, 0.2]
     motions = register(points, weights, target, motions, gates, along)
-    return Hypotheses(_steady(motions, points, weights, background, unit_length(source, target)), members)
+    return _steady(motions, points, weights, background, unit_length(source, target))
 
 
 def _steady(motions: Tensor, points: Tensor, weights: Tensor, background: Tensor, unit: Tensor) -> Tensor:

@@ -8,13 +8,24 @@ import torch
 from torch import Tensor, nn
 
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.hypotheses import OPEN, TRUNCATION, USUAL_TURN, Hypotheses, Leftover, pick_members, point_units
+from torchcrf_scan.inference.hypotheses import (
+    OPEN,
+    TRUNCATION,
+    USUAL_TURN,
+    Hypotheses,
+    Leftover,
+    ends,
+    pick_members,
+    pieces,
+    point_units,
+)
 from torchcrf_scan.inference.surface import Surface, look_along
 
 EXPLAINED = 1.0  # units up to which it is explained well
-FEATURE_POINTS = 40
+FEATURE_POINTS = 24
 REACH = 6.0  # units, and the extent: how far from the members unexplained points of the target are asked for
 AROUND = 15  # beams
+JUMP = 4.0  # units of range that the beams beside an object go on, when it surely stands before them
 
 FEATURES = (
     "size",
@@ -51,6 +62,15 @@ FEATURES = (
     "target_total_gain_to_best",
     "units_around",
     "scene_open",
+    "unexcused",
+    "landing_unexcused",
+    "unexcused_both",
+    "landing_occluded_before",
+    "fair_gain",
+    "share_of_piece",
+    "landing_piece_cover",
+    "stands_out",
+    "landing_stands_out",
 )
 
 
@@ -103,6 +123,8 @@ def hypothesis_features(hypotheses: Hypotheses, source: Surface, target: Surface
     columns |= _motion_features(hypotheses, landing, source, background)
     columns |= _rival_features(hypotheses, columns)
     columns |= _scene_features(hypotheses, leftover)
+    columns |= _excuse_features(hypotheses, landing, leftover)
+    columns |= _piece_features(hypotheses, landing, source, target)
     return torch.stack([columns[name] for name in FEATURES], dim=-1)
 
 
@@ -161,9 +183,8 @@ def _target_features(landing: Landing, leftover: Leftover, source: Surface, targ
     count = is_near.sum(-1)
     units = landing.target_units.clamp(max=TRUNCATION)
     gain = ((leftover.target - units) * is_near).sum(-1)
-    landed = torch.zeros(len(count), int(target.segment.max()) + 1, dtype=torch.bool, device=count.device)
-    landed.scatter_(1, target.segment[landing.nearest], True)
-    there = landed[:, target.segment] & is_open  # (H, M) unexplained points of the segments that the members land on
+    landed = torch.zeros_like(is_near).scatter_(1, landing.nearest, True)
+    there = _spread_over(landed, target.segment) & is_open  # (H, M) unexplained points of the segments that the members land on
     return {
         "target_open": count.to(gain).log1p(),
         "target_residual": (units * is_near).sum(-1) / count.clamp(min=1),
@@ -215,6 +236,57 @@ def _scene_features(hypotheses: Hypotheses, leftover: Leftover) -> dict[str, Ten
         "units_around": (beside @ leftover.source + 2) / (beside.sum(-1) + 3),  # as if 3 more points had 2 units in all
         "scene_open": rest @ is_open / rest.sum(-1).clamp(min=1),
     }
+
+
+def _excuse_features(hypotheses: Hypotheses, landing: Landing, leftover: Leftover) -> dict[str, Tensor]:
+    """How much is left unexplained although the other scan looks there: what is out of its sight needs no mover."""
+    before = leftover.source[landing.index]
+    excused = (leftover.source_sight.occluded | leftover.source_sight.unmeasured)[landing.index]
+    landing_excused = (leftover.target_sight.occluded | leftover.target_sight.unmeasured)[landing.nearest]
+    unexcused = landing.mean((before >= OPEN) & ~excused)
+    landing_unexcused = landing.mean((leftover.target[landing.nearest] >= OPEN) & ~landing_excused)
+    gain = landing.mean(torch.where(excused, before.clamp(max=EXPLAINED), before) - landing.units)
+    return {
+        "unexcused": unexcused,
+        "landing_unexcused": landing_unexcused,
+        "unexcused_both": (unexcused * landing_unexcused).sqrt(),
+        "landing_occluded_before": landing.mean(leftover.target_sight.occluded[landing.nearest]),
+        "fair_gain": (gain * hypotheses.members.sum(-1)).clamp(min=0).log1p(),
+    }
+
+
+def _piece_features(hypotheses: Hypotheses, landing: Landing, source: Surface, target: Surface) -> dict[str, Tensor]:
+    """Whether the members, and what they land on, are whole pieces of surface that stand before what surrounds them."""
+    size = hypotheses.members.sum(-1)
+    piece, target_piece = pieces(source), pieces(target)
+    whole = (hypotheses.members * torch.bincount(piece)[piece]).sum(-1) / size
+    landed = torch.zeros_like(landing.target_units, dtype=torch.bool).scatter_(1, landing.nearest, True)
+    is_covered = landing.target_units < OPEN
+    there = _spread_over(landed, target_piece)
+    return {
+        "share_of_piece": (size / whole).clamp(max=1.0),
+        "landing_piece_cover": (there & is_covered).sum(-1) / there.sum(-1),
+        "stands_out": _stands_out(source, hypotheses.members),
+        "landing_stands_out": _stands_out(target, landed | is_covered),
+    }
+
+
+def _spread_over(sets: Tensor, number: Tensor) -> Tensor:
+    """(H, P) bool: all points of the segments that a point of the set is on. sets: (H, P) bool; number: (P,) of the segments."""
+    touched = torch.zeros(len(sets), int(number.max()) + 1, dtype=torch.int64, device=sets.device)
+    return touched.scatter_add_(1, number.expand(len(sets), -1), sets.long())[:, number] > 0
+
+
+def _stands_out(surface: Surface, members: Tensor) -> Tensor:
+    """(H,) -1 to 1: whether the returns beside both ends of the members lie behind them, or before. members: (H, P) bool."""
+    first, last = ends(members)
+    unit = JUMP * point_units(surface)
+    sides = []
+    for end, beside in ((first, first - 1), (last, last + 1)):
+        is_inside = (beside >= 0) & (beside < len(surface)) | surface.is_closed
+        jump = (surface.ranges[beside % len(surface)] - surface.ranges[end]) / unit[end]
+        sides.append(jump.clamp(-1, 1) * is_inside)
+    return torch.stack(sides).mean(0)
 
 
 def share_in_common(sets: Tensor) -> Tensor:

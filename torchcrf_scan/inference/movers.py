@@ -8,61 +8,84 @@ import torch
 from torch import Tensor, nn
 
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference.background import unit_length
 from torchcrf_scan.inference.hypotheses import Hypotheses, residual_units
 from torchcrf_scan.inference.hypothesis_features import EXPLAINED, FEATURES, Landing, share_in_common
 from torchcrf_scan.inference.surface import Surface
 
 AS_WELL = 0.5  # units; a motion that fits this much worse at most explains the points as well
 LARGEST = 4.0  # standard deviations; what lies beyond tells no more
+APART = 4.0  # units, and half the extent, from which on two objects of one motion are two
 SHARED = 0.4  # share of points in common from which two hypotheses compete
 
-# Feature: its mean, its scale, and the weights of the standardised feature and of its square; fitted on 110 simulated pairs.
+# Feature: its mean, its scale, and the weights of the standardised feature and of its square. All weights of this file are those
+# of `learning.hypothesis_fit.fit_mixture()`.
 STREETS_AND_ROOMS = {
-    "size": (2.468, 0.986, -0.409, 0.037),
-    "share_of_segment": (0.79, 0.341, 0.264, -0.236),
-    "extent": (2.085, 0.832, -0.095, 0.165),
-    "linearity": (0.802, 0.177, -0.285, -0.163),
-    "range": (0.179, 0.655, -0.595, -0.007),
-    "residual": (1.03, 0.564, 0.071, -0.064),
-    "gain": (0.555, 0.961, 0.561, 0.154),
-    "total_gain": (1.492, 1.16, 0.107, -0.029),
-    "explained": (0.631, 0.276, 0.069, 0.077),
-    "open_before": (0.529, 0.391, 0.264, -0.333),
-    "occluded_before": (0.111, 0.232, 0.102, -0.092),
-    "seen_through_before": (0.053, 0.173, 0.405, -0.05),
-    "seen_through": (0.079, 0.16, -0.423, -0.157),
-    "occluded": (0.08, 0.149, -0.59, -0.022),
-    "distinct": (0.555, 0.278, 0.144, -0.116),
-    "landing_open": (0.311, 0.327, -0.04, -0.14),
-    "landing_seen_through_before": (0.055, 0.175, 0.572, -0.08),
-    "target_open": (1.808, 0.852, -0.386, -0.266),
-    "target_residual": (1.846, 0.871, 0.006, 0.027),
-    "target_gain": (0.324, 0.874, 0.387, 0.144),
-    "target_total_gain": (0.882, 1.008, 0.223, 0.002),
-    "target_cover": (0.404, 0.364, -0.005, -0.012),
-    "displacement": (2.251, 1.195, -0.2, -0.23),
-    "displacement_in_spacings": (2.461, 1.255, -0.013, -0.385),
-    "displacement_in_range": (0.308, 0.32, -0.483, 0.095),
-    "displacement_in_extent": (1.117, 1.019, -0.694, -1.016),
-    "along_surface": (0.703, 0.215, -0.289, 0.063),
-    "rotation": (0.531, 0.608, -0.571, -0.235),
-    "gain_both_ways": (1.873, 1.128, 0.275, 0.232),
-    "residual_to_best": (0.517, 0.525, -0.245, 0.151),
-    "total_gain_to_best": (-0.843, 0.934, 0.275, 0.014),
-    "target_total_gain_to_best": (-0.966, 0.893, 0.049, 0.224),
-    "units_around": (1.061, 0.356, 0.188, 0.068),
-    "scene_open": (0.203, 0.097, -0.168, -0.051),
+    "size": (2.3, 0.943, -0.636, -0.147),
+    "share_of_segment": (0.579, 0.368, 0.502, -0.238),
+    "extent": (1.796, 0.783, -0.201, 0.215),
+    "linearity": (0.824, 0.162, -0.095, 0.021),
+    "range": (0.104, 0.657, -0.635, -0.051),
+    "residual": (0.868, 0.483, 0.127, -0.229),
+    "gain": (0.711, 0.884, 0.599, 0.082),
+    "total_gain": (1.574, 1.075, 0.02, -0.141),
+    "explained": (0.706, 0.258, 0.22, -0.004),
+    "open_before": (0.5, 0.377, 0.31, -0.102),
+    "occluded_before": (0.12, 0.262, 0.073, -0.142),
+    "seen_through_before": (0.053, 0.179, 0.504, -0.08),
+    "seen_through": (0.044, 0.118, -0.477, -0.148),
+    "occluded": (0.055, 0.129, -0.225, -0.221),
+    "distinct": (0.567, 0.268, 0.155, -0.071),
+    "landing_open": (0.306, 0.333, 0.028, -0.018),
+    "landing_seen_through_before": (0.049, 0.177, 0.237, -0.046),
+    "target_open": (1.622, 0.858, -0.005, -0.233),
+    "target_residual": (1.742, 0.9, 0.087, 0.094),
+    "target_gain": (0.379, 0.876, 0.258, 0.139),
+    "target_total_gain": (0.863, 0.966, 0.218, 0.029),
+    "target_cover": (0.335, 0.341, -0.226, 0.061),
+    "displacement": (2.381, 1.128, -0.47, 0.125),
+    "displacement_in_spacings": (2.54, 1.174, -0.117, -0.816),
+    "displacement_in_range": (0.283, 0.291, -0.505, -0.021),
+    "displacement_in_extent": (1.376, 1.047, -0.754, -0.83),
+    "along_surface": (0.747, 0.216, -0.258, 0.128),
+    "rotation": (0.47, 0.547, -0.749, -0.44),
+    "gain_both_ways": (1.917, 1.051, 0.372, 0.244),
+    "residual_to_best": (0.492, 0.461, 0.032, 0.446),
+    "total_gain_to_best": (-0.974, 0.909, 0.165, 0.14),
+    "target_total_gain_to_best": (-1.128, 0.885, -0.005, 0.074),
+    "units_around": (1.123, 0.382, 0.023, 0.021),
+    "scene_open": (0.244, 0.105, -0.279, 0.013),
+    "unexcused": (0.293, 0.321, 0.074, -0.03),
+    "landing_unexcused": (0.202, 0.282, 0.199, 0.059),
+    "unexcused_both": (0.152, 0.237, -0.088, -0.142),
+    "landing_occluded_before": (0.047, 0.167, 0.077, -0.046),
+    "fair_gain": (1.096, 1.007, -0.128, 0.074),
+    "share_of_piece": (0.891, 0.256, 0.153, 0.05),
+    "landing_piece_cover": (0.557, 0.31, 0.168, 0.098),
+    "stands_out": (0.081, 0.611, 0.389, -0.045),
+    "landing_stands_out": (0.081, 0.484, 0.329, 0.094),
 }
-BIAS, THRESHOLD = -4.902, 0.35
+BIAS, THRESHOLD = -5.785, 0.4
+
+PRODUCTS = {  # of two standardised features: the weight
+    ("displacement_in_extent", "total_gain_to_best"): -0.402,
+    ("displacement_in_extent", "share_of_segment"): -0.448,
+    ("displacement_in_extent", "landing_piece_cover"): -0.246,
+    ("displacement_in_spacings", "range"): -0.76,
+    ("displacement_in_spacings", "unexcused"): -0.25,
+    ("displacement", "target_total_gain"): 0.073,
+    ("range", "unexcused"): 0.052,
+    ("along_surface", "stands_out"): 0.142,
+}
 
 
 class HypothesisScore(nn.Module):
-    """Probability that a hypothesis is a mover's motion: logistic in the standardised features and their squares.
+    """Probability that a hypothesis is a mover's motion: logistic in the standardised features, their squares and a few products.
 
     It starts with weights fitted on simulated streets, model cars and rooms; `learning.hypothesis_fit` fits others.
 
     Attributes:
-        mean, scale: (F,). weight: (2F,) of the standardised features, then of their squares. bias: ().
+        mean, scale: (F,). weight: (2F + R,) of the standardised features, then of their squares, then of `PRODUCTS`. bias: ().
         threshold: () probability from which a hypothesis is accepted.
     """
 
@@ -77,14 +100,16 @@ class HypothesisScore(nn.Module):
         mean, scale, weight, of_square = torch.tensor([STREETS_AND_ROOMS[name] for name in FEATURES]).unbind(-1)
         self.register_buffer("mean", mean.clone())
         self.register_buffer("scale", scale.clone())
-        self.register_buffer("weight", torch.cat([weight, of_square]))
+        self.register_buffer("weight", torch.cat([weight, of_square, torch.tensor(list(PRODUCTS.values()))]))
         self.register_buffer("bias", torch.tensor(BIAS))
         self.register_buffer("threshold", torch.tensor(THRESHOLD))
 
     def terms(self, features: Tensor) -> Tensor:
-        """(..., F) features of `hypothesis_features` -> (..., 2F) the terms that the weights belong to."""
+        """(..., F) features of `hypothesis_features` -> (..., 2F + R) the terms that the weights belong to."""
         standard = ((features - self.mean) / self.scale).clamp(-LARGEST, LARGEST)
-        return torch.cat([standard, standard**2], dim=-1)
+        one, other = zip(*PRODUCTS, strict=True)
+        products = standard[..., [FEATURES.index(name) for name in one]] * standard[..., [FEATURES.index(name) for name in other]]
+        return torch.cat([standard, standard**2, products], dim=-1)
 
     def forward(self, features: Tensor) -> Tensor:
         """(..., F) features of `hypothesis_features` -> (...) probabilities."""
@@ -112,7 +137,7 @@ def select(
     """Accepts the surest hypothesis, drops what competes with it, and so on: non-maximum suppression.
 
     Two compete when they move the same points, explain the same points of the second scan, or when the accepted motion explains
-    the other's points as well.
+    the other's points as well and these are so near that they may be of the same object.
 
     Args:
         probabilities: (H,).
@@ -140,7 +165,21 @@ def _rivals(pool: Hypotheses, source: Surface, target: Surface) -> Tensor:
     by_other = residual_units(se2.apply(pool.motions[:, None], source.points[landing.index]), target)  # (g, h, L)
     count = landing.is_member.sum(-1)
     by_other = (by_other * landing.is_member).sum(-1) / count
-    return same_points | same_goal | (by_other.T - landing.mean(landing.units)[:, None] < AS_WELL)
+    is_as_well = by_other.T - landing.mean(landing.units)[:, None] < AS_WELL
+    return same_points | same_goal | (is_as_well & _are_near(pool.members, source.points, unit_length(source, target)))
+
+
+def _are_near(members: Tensor, points: Tensor, unit: Tensor) -> Tensor:
+    """(H, H) bool: the members of h lie within reach of those of g, which is what `initialise.within_reach` takes for an object.
+
+    Args:
+        members: (H, P) bool. points: (P, 2). unit: () metres.
+    """
+    low = points.where(members[..., None], torch.inf).amin(1)  # (H, 2)
+    high = points.where(members[..., None], -torch.inf).amax(1)
+    gap = torch.maximum(low[:, None] - high, low - high[:, None]).clamp(min=0)  # (h, g, 2) between the boxes round them
+    reach = torch.linalg.vector_norm(high - low, dim=-1) / 2 + APART * unit
+    return torch.linalg.vector_norm(gap, dim=-1) < reach
 
 
 def find_movers(

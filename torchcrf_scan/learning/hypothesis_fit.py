@@ -15,7 +15,7 @@ from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.background import background_pool, unit_length
-from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
+from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise, point_units
 from torchcrf_scan.inference.hypothesis_features import FEATURES, hypothesis_features
 from torchcrf_scan.inference.movers import HypothesisScore, select
 from torchcrf_scan.inference.surface import Surface
@@ -34,6 +34,7 @@ KEPT_BEAMS = (0.5, 1.0)
 PURE = 0.7  # share of a mover's points in the members of a hypothesis that is taken as its
 TOLERANCE, TOLERANCE_SHARE = 1.0, 0.12  # units and share of the displacement up to which a motion is right
 THRESHOLDS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)
+FALSE_COST = 2.0  # a false mover is as bad as that many missed ones
 VIEWS = 3  # of every pair
 REGULARISATION = 0.03  # inverse; looser weights fit the simulator, not the world
 MODEL_CAR = SimulatorConfig(scale=0.1, fov=360.0, beams=360, range_max=9.0, dropout=0.3, dt=0.24)
@@ -73,6 +74,12 @@ def simulate_mixture(count: int, seed: int) -> list[ScanPair]:
         number = max(1, round(share * count))
         pairs += simulate_pairs(config, number, number, seed + index)
     return pairs
+
+
+def fit_mixture(count: int = 110, seed: int = 0) -> HypothesisScore:
+    """The score fitted on simulated pairs alone; the defaults give what `HypothesisScore` begins with. Takes minutes."""
+    pairs = simulate_mixture(count, seed)
+    return fit_hypothesis_score([view for k, pair in enumerate(pairs) for view in view_pair(pair, seed + k, views=2)])
 
 
 def view_pair(pair: ScanPair, seed: int, views: int = VIEWS) -> list[HypothesisView]:
@@ -163,7 +170,8 @@ def label_hypotheses(hypotheses: Hypotheses, source: Surface, body: Tensor, moti
     pure = most / hypotheses.members.sum(-1)
     error = _apart(hypotheses.motions, motions[which], source.points, hypotheses.members)
     travel = _apart(motions[:1].expand(len(which), -1), motions[which], source.points, hypotheses.members)
-    tolerance = torch.maximum(TOLERANCE * unit, TOLERANCE_SHARE * travel)
+    local = (hypotheses.members * point_units(source)).sum(-1) / hypotheses.members.sum(-1)  # far away, points tell less
+    tolerance = torch.maximum(TOLERANCE * torch.maximum(local, unit), TOLERANCE_SHARE * travel)
     right = (pure >= PURE) & (which > 0) & (travel > unit) & (error < tolerance)
     between = (pure >= 0.5) & (which > 0) & (error < 1.5 * tolerance) & (travel > 0.5 * unit)
     between |= error.isnan() | ((hypotheses.members & (body == IGNORED)).sum(-1) > hypotheses.members.sum(-1) / 2)
@@ -177,10 +185,10 @@ def _apart(one: Tensor, other: Tensor, points: Tensor, members: Tensor) -> Tenso
 
 
 def _best_threshold(score: HypothesisScore, views: Sequence[HypothesisView]) -> float:
-    """The probability at which accepted movers have the best F1 score."""
+    """The probability at which accepted movers have the best F score: false ones cost more than missed ones."""
     results = np.array([_count_accepted(score, view) for view in views]).sum(0)  # (T, 3)
     right, accepted, true = results.T
-    return THRESHOLDS[int((2 * right / np.maximum(accepted + true, 1)).argmax())]
+    return THRESHOLDS[int(((1 + FALSE_COST) * right / np.maximum(FALSE_COST * accepted + true, 1)).argmax())]
 
 
 def _count_accepted(score: HypothesisScore, view: HypothesisView) -> list[tuple[int, int, int]]:
