@@ -47,11 +47,11 @@ def test_help_tells_every_option(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(name in help_of(capsys) for name in cli.COMMANDS)
     simulate = help_of(capsys, "simulate")
     assert all(f"--simulator.{field.name}" in simulate for field in fields(SimulatorConfig))
-    assert all(f"--{name}" in help_of(capsys, "match") for name in ("output", "model", "candidates", "device", "threads"))
+    assert all(f"--{name}" in help_of(capsys, "match") for name in ("output", "every", "model", "candidates", "device", "threads"))
     evaluate = help_of(capsys, "evaluate")
-    assert all(f"--{name}" in evaluate for name in ("predictions", "method", "model", "json"))
+    assert all(f"--{name}" in evaluate for name in ("predictions", "method", "model", "json", "frame_offset", "frame_turn", "seed"))
     assert all(name in evaluate for name in METHODS)
-    assert all(f"--{name}" in help_of(capsys, "plot") for name in ("prediction", "model", "output"))
+    assert all(f"--{name}" in help_of(capsys, "plot") for name in ("number", "prediction", "model", "output"))
 
 
 @pytest.mark.parametrize(
@@ -62,6 +62,10 @@ def test_help_tells_every_option(capsys: pytest.CaptureFixture[str]) -> None:
         (["match", "a.npz"], "output"),
         (["match", "--output", "b"], "files"),
         (["match", "a.npz", "--output", "b", "--candidates", "many"], "candidates"),
+        (["match", "a.log", "--output", "b", "--every", "1.5"], "every"),
+        (["evaluate"], "pair_files"),
+        (["evaluate", "a.npz", "--frame_turn", "some"], "frame_turn"),
+        (["plot", "a.log", "--number", "last", "--output", "c.png"], "number"),
         (["match", "a.npz", "--output", "b", "--speed", "3"], "--speed"),
         (["simulate", "--output", "b", "--simulator.beams", "1.5"], "simulator.beams"),
         (["simulate", "--output", "b", "--simulator.beamz", "5"], "simulator.beamz"),

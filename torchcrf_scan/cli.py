@@ -28,6 +28,12 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
     "plot": plot,
 }
 
+POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: what is given, how many (one where None), meaning
+    "files": ("PAIR.npz|LOG", "+", "pair files (.npz), folders of them, CARMEN logs (.log, .log.gz), or glob patterns"),
+    "pair_files": ("PAIR.npz", "+", "pair files (.npz), folders of them, or glob patterns"),
+    "file": ("PAIR.npz|LOG", None, "a pair file (.npz), or with --number a CARMEN log (.log, .log.gz)"),
+}
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit code; bad usage and `--help` leave through `SystemExit`, as argparse does.
@@ -65,17 +71,15 @@ def make_parser() -> ArgumentParser:
 
 
 def _command_parser(name: str, command: Callable[..., int], summary: str) -> ArgumentParser:
-    """Options from the signature; a parameter `files` or `file` is given without a dash."""
+    """Options from the signature; a parameter of `POSITIONAL` is given without a dash."""
     parameters = inspect.signature(command).parameters
-    forms = {"files": "PAIR.npz ...", "file": "PAIR.npz", "output": "--output OUTPUT"}
-    shown = [form for key, form in forms.items() if key in parameters]
+    forms = {key: metavar + (" ..." if count else "") for key, (metavar, count, _) in POSITIONAL.items()}
+    shown = [form for key, form in {**forms, "output": "--output OUTPUT"}.items() if key in parameters]
     parser = ArgumentParser(description=summary, usage=" ".join(["torchcrf-scan", name, *shown, "[options]"]))
-    if "files" in parameters:
-        several = "pair files (.npz), folders of them, or glob patterns"
-        parser.add_argument("files", type=str, metavar="PAIR.npz", nargs="+", help=several)
-    if "file" in parameters:
-        parser.add_argument("file", type=str, metavar="PAIR.npz", help="a pair file (.npz)")
-    parser.add_function_arguments(command, as_group=False, as_positional=False, skip={"files", "file"})
+    for key, (metavar, count, meaning) in POSITIONAL.items():
+        if key in parameters:
+            parser.add_argument(key, type=str, metavar=metavar, nargs=count, help=meaning)
+    parser.add_function_arguments(command, as_group=False, as_positional=False, skip=set(POSITIONAL))
     return parser
 
 

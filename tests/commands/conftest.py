@@ -1,5 +1,6 @@
-"""Simulated pairs, a model and its predictions, made once by the commands themselves, and a pair made by hand."""
+"""Simulated pairs, a model and its predictions, made once by the commands themselves; a log and a pair made by hand."""
 
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from torchcrf_scan import JointScanCRF, ModelConfig, PairPrediction, Scan, ScanPair
 from torchcrf_scan.cli import main
+from torchcrf_scan.data.carmen import bearings_of
 
 
 @pytest.fixture(scope="session")
@@ -29,6 +31,29 @@ def predictions_dir(pairs_dir: Path, model_dir: Path, tmp_path_factory: pytest.T
     """The predictions of the four pairs."""
     folder = tmp_path_factory.mktemp("matched") / "predictions"
     assert main(["match", str(pairs_dir), "--output", str(folder), "--model", str(model_dir), "--threads=1"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def log_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of five readings, 0.1 m apart along a room 8 m wide, one of its 60 beams without return."""
+    bearings = bearings_of(60)
+    lines = []
+    for k in range(5):
+        ranges = np.minimum(4 / np.maximum(np.abs(np.sin(bearings)), 1e-6), (12 - 0.1 * k) / np.maximum(np.cos(bearings), 1e-6))
+        ranges[7] = 81.9
+        lines.append(f"FLASER 60 {' '.join(f'{value:.3f}' for value in ranges)} {0.1 * k} 0 0 {0.1 * k} 0 0 {k} host {k}\n")
+    file = tmp_path_factory.mktemp("logs") / "room.log.gz"
+    file.write_bytes(gzip.compress("".join(lines).encode()))
+    return file
+
+
+@pytest.fixture(scope="session")
+def real_logs_dir() -> Path:
+    """The folder of recorded logs."""
+    folder = Path(__file__).resolve().parents[3] / "shared" / "data" / "logs"
+    if not any(folder.glob("*.log.gz")):
+        pytest.skip(f"needs the recorded logs, which are not part of the repository: nothing in {folder}")
     return folder
 
 

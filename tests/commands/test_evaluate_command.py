@@ -14,7 +14,7 @@ from command_line import fail, run
 from torchcrf_scan import JointScanCRF, PairPrediction, ScanPair
 from torchcrf_scan.commands.evaluate import METHODS
 from torchcrf_scan.data.dataset import PairFiles
-from torchcrf_scan.data.pair_file import read_pair, write_pair, write_prediction
+from torchcrf_scan.data.pair_file import read_pair, read_prediction, write_pair, write_prediction
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.evaluation.summary import summarise
 
@@ -112,16 +112,47 @@ def test_tables_have_a_row_for_every_sequence_and_for_all(
     assert run("evaluate", pairs_dir, "--predictions", predictions_dir) == 0
     out = capsys.readouterr().out
     titles = [line.strip("*").split(":")[0] for line in out.splitlines() if line.startswith("**")]
-    assert titles == ["Overview", "Table I", "Table II", "Table III"]
+    assert titles == ["Overview", "Table I", "Table II", "Table III", "How sure"]
     for row in ("predictions, sim3_0", "predictions, sim3_1", "predictions, all"):
-        assert out.count(f"| {row} |") == 4
+        assert out.count(f"| {row} |") == 5
 
 
 def test_one_sequence_needs_one_row(pairs_dir: Path, predictions_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("evaluate", f"{pairs_dir}/sim_s0_*.npz", "--predictions", predictions_dir) == 0
     out = capsys.readouterr().out
-    assert out.count("| predictions, all |") == 4
+    assert out.count("| predictions, all |") == 5
     assert "sim3_0" not in out
+
+
+def test_figures_tell_how_sure_the_model_is(
+    pairs_dir: Path, predictions_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, figures = evaluate(capsys, tmp_path / "f.json", pairs_dir, "--predictions", predictions_dir)
+    for group in (figures["all"], *figures["sequences"].values()):
+        assert 0 <= group["association_ece"] <= 100
+        assert 0 <= group["cluster_ece"] <= 100
+        assert 0 <= group["nees_covered"] <= 100
+        assert group["nees_pairs"] == group["pairs"]
+        assert group["nees_low"] < 3 < group["nees_high"]
+    keys = ("association_ece", "cluster_ece", "nees_covered", "nees_mean", "nees_low", "nees_high")
+    cells = [f"{figures['all'][key]:.{digits}f}" for key, digits in zip(keys, (1, 1, 1, 2, 2, 2), strict=True)]
+    assert out.splitlines()[-1] == f"| predictions, all | {' | '.join(cells)} |"
+
+
+def test_predictions_that_do_not_say_how_well_motions_are_known(
+    pairs_dir: Path, predictions_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Older files, and other programs'."""
+    for path in predictions_dir.iterdir():
+        prediction = read_prediction(path)
+        write_prediction(tmp_path / path.name, replace(prediction, covariances=None, unobserved_turn=None, unobserved_shift=None))
+    out, figures = evaluate(capsys, tmp_path / "f.json", pairs_dir, "--predictions", tmp_path)
+    _, whole = evaluate(capsys, tmp_path / "w.json", pairs_dir, "--predictions", predictions_dir)
+    assert out.splitlines()[-1].endswith(" | - | - | - | - |")
+    assert {key for key, value in figures["all"].items() if value != whole["all"][key]} == {
+        *("nees_pairs", "nees_covered", "nees_mean", "nees_low", "nees_high")
+    }
+    assert figures["all"]["nees_mean"] is None
 
 
 def test_running_the_model_gives_the_figures_of_its_files(
@@ -144,6 +175,57 @@ def test_other_methods(pairs_dir: Path, model_dir: Path, tmp_path: Path, method:
     found = {key: np.nan if value is None else value for key, value in figures["all"].items()}
     assert found == pytest.approx(expected, nan_ok=True)
     assert f"| {method}, all |" in out
+
+
+@pytest.mark.parametrize("method", ["joint", "start"])
+def test_frames_that_stay_change_nothing_but_add_a_table(
+    pairs_dir: Path, model_dir: Path, tmp_path: Path, method: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = [pairs_dir, "--method", method, "--model", model_dir]
+    out, figures = evaluate(capsys, tmp_path / "a.json", *options)
+    same, displaced = evaluate(capsys, tmp_path / "b.json", *options, "--frame_offset=0")
+    extra = displaced.pop("displaced")
+    assert displaced["all"] == pytest.approx(figures["all"], abs=1e-4)
+    assert same.startswith(out)
+    assert (extra["metres"], extra["turn"], extra["seed"]) == (0, 0, 0)
+    scores = [score_pair(pair, answer) for pair, answer in zip(*answers_of(pairs_dir, model_dir, method), strict=True)]
+    assert extra["ego_success"]["all"] == 100 * np.mean([score.has_ego_within(0.2, 0.02) for score in scores])
+    assert list(extra["ego_success"]["sequences"]) == ["sim3_0", "sim3_1"]
+    assert "**The second scan's frame displaced by 0 m and turned by 0 rad**" in same
+    assert same.splitlines()[-1] == f"| {method}, all | {extra['ego_success']['all']:.1f} |"
+
+
+def answers_of(pairs_dir: Path, model_dir: Path, method: str) -> tuple[list[ScanPair], list[PairPrediction]]:
+    pairs = list(PairFiles(pairs_dir))
+    return pairs, METHODS[method](lambda: JointScanCRF.from_pretrained(model_dir))(pairs)
+
+
+def test_displaced_frames_are_drawn_from_the_seed(
+    pairs_dir: Path, model_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = [pairs_dir, "--method=start", "--model", model_dir, "--frame_offset=3.5"]
+    figures = [
+        evaluate(capsys, tmp_path / "f.json", *options, "--frame_turn", turn, "--seed", seed)[1]
+        for turn, seed in ((0.35, 1), (0.35, 1), (0.35, 2), ("any", 1))
+    ]
+    assert figures[0] == figures[1]
+    errors = [figure["all"]["ego_translation_mean"] for figure in figures]
+    assert len(set(errors)) == 3
+    assert [figure["displaced"]["turn"] for figure in figures] == [0.35, 0.35, 0.35, "any"]
+
+
+def test_evaluate_names_the_bad_displacement(
+    pairs_dir: Path, predictions_dir: Path, model_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def message(*options: object) -> str:
+        return fail(capsys, "evaluate", pairs_dir, *options)
+
+    assert "--frame_offset: expected metres, 0 or more, got -1" in message("--frame_offset=-1")
+    assert "--frame_turn: expected radians from 0 to pi, or any, got 4" in message("--frame_turn=4")
+    assert "expected no --predictions" in message("--frame_turn=any", "--predictions", predictions_dir)
+    for method in ("static", "background", "icp", "ransac"):
+        got = message("--frame_offset=1", "--method", method)
+        assert f"--method: expected one of joint, start with --frame_offset or --frame_turn, got {method}" in got
 
 
 def test_static_needs_no_model(pairs_dir: Path) -> None:

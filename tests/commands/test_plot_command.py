@@ -23,6 +23,28 @@ def test_plot_draws_pair_prediction_and_model(
     assert pictures[0] != pictures[1] == pictures[2]
 
 
+def test_plot_draws_a_pair_of_a_log(
+    log_file: Path, model_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(plots, "save_figure", partial(plots.save_figure, dpi=15))
+    picture = tmp_path / "a.png"
+    assert run("plot", log_file, "--number=3", "--model", model_dir, "--output", picture) == 0
+    assert capsys.readouterr().out == f"room_00003 drawn in {picture}\n"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_plot_asks_for_the_number_of_a_logs_pair(
+    log_file: Path, pairs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def message(*arguments: object) -> str:
+        return fail(capsys, "plot", *arguments, "--output", tmp_path / "a.png")
+
+    for options, got in (([], "None"), (["--number=4"], "4"), (["--number=-1"], "-1")):
+        assert f"--number: expected which pair of {log_file}, 0 to 3, got {got}" in message(log_file, *options)
+    assert "--number: expected none but with a log" in message(pairs_dir / "sim_s0_000.npz", "--number=0")
+    assert "nowhere.log" in message(tmp_path / "nowhere.log", "--number=0")
+
+
 def test_plot_names_the_bad_argument(
     pairs_dir: Path,
     predictions_dir: Path,

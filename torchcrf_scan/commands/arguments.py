@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import torch
 from safetensors import SafetensorError
 
+from torchcrf_scan.commands.failures import attempt
+from torchcrf_scan.data.carmen import CarmenLog, is_log
 from torchcrf_scan.data.dataset import PairFiles
+from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.scan import ScanPair
 
 Item = TypeVar("Item")
 
@@ -34,13 +39,77 @@ def load_model(name: str, candidates: int | None = None, device: str = "cpu", th
         raise ValueError(f"--device: expected one that torch can use here, got {device} ({error})") from error
 
 
+@dataclass(frozen=True, slots=True)
+class PairPlace:
+    """Where a pair is found: in a file of its own, or at a number of a log."""
+
+    path: Path
+    log: CarmenLog | None = None
+    number: int = 0
+
+    @property
+    def name(self) -> str:
+        """The name of the pair, and of its prediction file."""
+        return self.path.stem if self.log is None else self.log.pair_name(self.number)
+
+    def __str__(self) -> str:
+        return str(self.path) if self.log is None else f"{self.path}, pair {self.number}"
+
+    def read(self) -> ScanPair:
+        """The pair itself."""
+        return read_pair(self.path) if self.log is None else self.log[self.number]
+
+
 def find_files(patterns: Sequence[str]) -> list[Path]:
     """The files that match, each once; two of the same name raise ValueError: predictions are named like their pairs."""
-    found: dict[str, Path] = {}
-    for path in PairFiles(*patterns).paths:
-        first = found.setdefault(path.stem, path)
-        if not first.samefile(path):
-            raise ValueError(f"{path}: expected file names that differ, got the name of {first} again")
+    return [place.path for place in _each_once(PairPlace(path) for path in PairFiles(*patterns).paths)]
+
+
+def find_pairs(patterns: Sequence[str], every: int, failures: list[str]) -> list[PairPlace]:
+    """The pairs of the files that match, each once, of logs every N-th; two of the same name raise ValueError.
+
+    A log that cannot be read has none, then `failures` gets the reason.
+    """
+    paths = PairFiles(*patterns).paths
+    if every < 1:
+        raise ValueError(f"--every: expected at least 1, got {every}")
+    if every > 1 and not any(is_log(path) for path in paths):
+        raise ValueError(f"--every: expected a log (.log, .log.gz) to take every {every}-th pair of, got pair files alone")
+    found = []
+    for path in paths:
+        if not is_log(path):
+            found.append(PairPlace(path))
+        elif (log := attempt(failures, read_log, path)) is not None:
+            found += [PairPlace(path, log, number) for number in range(0, len(log), every)]
+    return _each_once(found)
+
+
+def read_log(path: str | Path) -> CarmenLog:
+    """A log with at least one pair."""
+    log = CarmenLog(path)
+    if not len(log):
+        raise ValueError(f"{path}: expected at least two lines that start with FLASER, got one")
+    return log
+
+
+def read_one(file: str, number: int | None) -> ScanPair:
+    """The pair of a pair file, which has no number, or one of the pairs of a log."""
+    if not is_log(file):
+        if number is not None:
+            raise ValueError(f"--number: expected none but with a log (.log, .log.gz), got {number} with {file}")
+        return read_pair(file)
+    log = read_log(file)
+    if number is None or not 0 <= number < len(log):
+        raise ValueError(f"--number: expected which pair of {file}, 0 to {len(log) - 1}, got {number}")
+    return log[number]
+
+
+def _each_once(places: Iterable[PairPlace]) -> list[PairPlace]:
+    found: dict[str, PairPlace] = {}
+    for place in places:
+        first = found.setdefault(place.name, place)
+        if first is not place and not first.path.samefile(place.path):
+            raise ValueError(f"{place}: expected pair names that differ, got the name of {first} again")
     return list(found.values())
 
 

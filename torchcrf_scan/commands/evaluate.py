@@ -8,21 +8,28 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import torch
 from tqdm import tqdm
 
 from torchcrf_scan.baselines.start import match_start, match_static
+from torchcrf_scan.commands import frames
 from torchcrf_scan.commands.arguments import batches, find_files, load_model, make_folder
+from torchcrf_scan.commands.frames import FrameOffset, Turn, match_displaced
 from torchcrf_scan.data.pair_file import read_pair, read_prediction
 from torchcrf_scan.model import PRETRAINED, JointScanCRF
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 if TYPE_CHECKING:
     from torchcrf_scan.evaluation.metrics import PairScore
+    from torchcrf_scan.evaluation.report import Table
 
+Item = TypeVar("Item")
 Method = Callable[[Sequence[ScanPair]], list[PairPrediction]]
 Loader = Callable[[], JointScanCRF]
+
+FAR_TRANSLATION, FAR_ROTATION = 0.2, 0.02  # metres, radians: an ego motion found although the frames are displaced
 
 
 def one_by_one(module: str, name: str) -> Method:
@@ -42,27 +49,35 @@ METHODS: dict[str, Callable[[Loader], Method]] = {
 
 
 def evaluate(
-    files: list[str],
+    pair_files: list[str],
     *,
     predictions: str | None = None,
     method: str | None = None,
     model: str | None = None,
     json: str | None = None,
+    frame_offset: float | None = None,
+    frame_turn: Turn | None = None,
+    seed: int = 0,
     candidates: int | None = None,
     device: str = "cpu",
     threads: int | None = None,
 ) -> int:
-    """Prints how good predictions of annotated pairs are: an overview and the paper's Tables I to III, by sequence and in all.
+    """Prints how good predictions of annotated pairs are: an overview, the paper's Tables I to III, how sure; by sequence, in all.
 
-    The predictions are read from files, or made here by a method.
+    The predictions are read from files, or made here by a method. With `--frame_offset` or `--frame_turn` every second scan is
+    given to the method (joint or start) in another frame, of which it is not told; what it finds is scored in the pair's own
+    frames, and a table tells how often the ego motion is within 20 cm and 0.02 rad all the same.
 
     Args:
-        files: pair files with annotation
+        pair_files: pair files with annotation
         predictions: folder of prediction files named like the pair files, instead of a method
         method: joint (the model, where absent), start (its start and nearest points, no field), static (nothing moves), background
             (one registration, all of it background), icp (the paper's) or ransac (registration, then movers by RANSAC)
         model: folder of a saved model, or the name of one that the package ships; simulated where absent
         json: file for all figures with all digits
+        frame_offset: metres by which the second scan's frame is displaced, exactly, in a random direction
+        frame_turn: radians by which it is turned, exactly, to a random side; or any, uniform over the whole circle
+        seed: seed of the random directions and sides
         candidates: target points considered for each source point, 0 for all; as the model was saved where absent
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; its own choice where absent
@@ -72,20 +87,34 @@ def evaluate(
 
     if predictions is not None and (method, model) != (None, None):
         raise ValueError("--predictions: expected no --method and no --model beside it, got both")
+    displacement = _displacement(frame_offset, frame_turn, predictions)
     if json is not None:
         make_folder("--json", Path(json).parent)
-    pairs = _annotated_pairs(files)
+    pairs = _annotated_pairs(pair_files)
     if predictions is not None:
         name, answers = Path(predictions).resolve().name, _read_predictions(list(pairs), Path(predictions))
     else:
         name = "joint" if method is None else method
         load = partial(load_model, PRETRAINED if model is None else model, candidates, device, threads)
-        answers = _run(name, load, list(pairs.values()))
+        answers = _run(name, load, list(pairs.values()), displacement, seed)
     scores = [score_pair(pair, answer) for pair, answer in zip(pairs.values(), answers, strict=True)]
-    print("\n".join(table.to_markdown() for table in report(_rows(name, scores))), end="")
+    tables, figures = report(_rows(name, scores)), _figures(name, scores)
+    if displacement is not None:
+        tables.append(_displaced_table(displacement, _rows(name, scores)))
+        figures |= _displaced_figures(displacement, seed, scores)
+    print("\n".join(table.to_markdown() for table in tables), end="")
     if json is not None:
-        Path(json).write_text(json_format.dumps(_figures(name, scores), indent=2) + "\n")
+        Path(json).write_text(json_format.dumps(figures, indent=2) + "\n")
     return 0
+
+
+def _displacement(metres: float | None, turn: Turn | None, predictions: str | None) -> FrameOffset | None:
+    """What `--frame_offset` and `--frame_turn` ask for, the absent one being 0."""
+    if metres is None and turn is None:
+        return None
+    if predictions is not None:
+        raise ValueError("--frame_offset, --frame_turn: expected no --predictions beside them, got both")
+    return FrameOffset(metres or 0.0, turn or 0.0)
 
 
 def _annotated_pairs(patterns: Sequence[str]) -> dict[Path, ScanPair]:
@@ -105,16 +134,46 @@ def _read_predictions(paths: Sequence[Path], folder: Path) -> list[PairPredictio
     return [read_prediction(file) for file in files]
 
 
-def _run(name: str, load: Loader, pairs: Sequence[ScanPair]) -> list[PairPrediction]:
+def _run(name: str, load: Loader, pairs: Sequence[ScanPair], displacement: FrameOffset | None, seed: int) -> list[PairPrediction]:
     if name not in METHODS:
         raise ValueError(f"--method: expected one of {', '.join(METHODS)}, got {name}")
-    method = METHODS[name](load)
+    if displacement is None:
+        return _in_batches(METHODS[name](load), pairs)
+    if name not in frames.METHODS:
+        raise ValueError(f"--method: expected one of {', '.join(frames.METHODS)} with --frame_offset or --frame_turn, got {name}")
+    offsets = displacement.draw(len(pairs), torch.Generator().manual_seed(seed))
+    return _in_batches(partial(match_displaced, name, load()), list(zip(pairs, offsets, strict=True)))
+
+
+def _in_batches(method: Callable[[Sequence[Item]], list[PairPrediction]], items: Sequence[Item]) -> list[PairPrediction]:
     found: list[PairPrediction] = []
-    with tqdm(total=len(pairs), unit="pair", disable=None) as bar:
-        for part in batches(pairs):
+    with tqdm(total=len(items), unit="pair", disable=None) as bar:
+        for part in batches(items):
             found += method(part)
             bar.update(len(part))
     return found
+
+
+def _displaced_table(displacement: FrameOffset, rows: dict[str, list[PairScore]]) -> Table:
+    """How often the ego motion is found from afar."""
+    from torchcrf_scan.evaluation.report import Table
+
+    heading = f"ego within {100 * FAR_TRANSLATION:.0f} cm and {FAR_ROTATION:g} rad (%)"
+    shares = tuple((name, _found_from_afar(scores)) for name, scores in rows.items())
+    return Table(f"The second scan's frame {displacement}", ("method", heading), shares, (0, 1))
+
+
+def _displaced_figures(displacement: FrameOffset, seed: int, scores: Sequence[PairScore]) -> dict[str, Any]:
+    """What `--json` writes besides: the displacement and the share found from afar."""
+    sequences = {sequence: _found_from_afar(part) for sequence, part in _by_sequence(scores).items()}
+    found = {"all": _found_from_afar(scores), "sequences": sequences}
+    return {"displaced": {"metres": displacement.metres, "turn": displacement.turn, "seed": seed, "ego_success": found}}
+
+
+def _found_from_afar(scores: Sequence[PairScore]) -> float:
+    """Percentage of the known ego motions that are found to within `FAR_TRANSLATION` and `FAR_ROTATION`."""
+    known = [score for score in scores if score.has_ego_truth]
+    return 100 * sum(score.has_ego_within(FAR_TRANSLATION, FAR_ROTATION) for score in known) / max(len(known), 1)
 
 
 def _by_sequence(scores: Sequence[PairScore]) -> dict[str, list[PairScore]]:

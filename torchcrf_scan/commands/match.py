@@ -1,18 +1,18 @@
-"""`torchcrf-scan match`: predictions of pair files by a saved model, a file and a line each."""
+"""`torchcrf-scan match`: predictions of pair files and logs by a saved model, a file and a line a pair."""
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from torchcrf_scan.commands.arguments import batches, find_files, load_model, make_folder
+from torchcrf_scan.commands.arguments import batches, find_pairs, load_model, make_folder
 from torchcrf_scan.commands.failures import attempt, one_line
-from torchcrf_scan.data.pair_file import read_pair, read_prediction, write_prediction
+from torchcrf_scan.data.pair_file import read_prediction, write_prediction
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.velocity import ground_velocity
 from torchcrf_scan.model import PRETRAINED, JointScanCRF
@@ -23,40 +23,55 @@ def match(
     files: list[str],
     output: str,
     *,
+    every: int = 1,
     model: str = PRETRAINED,
     candidates: int | None = None,
     device: str = "cpu",
     threads: int | None = None,
 ) -> int:
-    """Matches scan pairs: writes OUTPUT/<same name>.npz for each and prints how the sensor and the movers went.
+    """Matches scan pairs: writes OUTPUT/<name of the pair>.npz for each and prints how the sensor and the movers went.
 
-    Earlier predictions are replaced, other files never. A file that cannot be read or written does not stop the others; it is
-    reported at the end.
+    A pair is a file, or two consecutive readings of a log; those of run.log are named run_00000, run_00001 and so on. Earlier
+    predictions are replaced, other files never. What cannot be read or written does not stop the others; it is reported at the
+    end.
 
     Args:
-        files: pair files
+        files: pair files and logs
         output: folder of the prediction files, made if need be
+        every: takes each N-th pair of a log only
         model: folder of a saved model, or the name of one that the package ships
         candidates: target points considered for each source point, 0 for all; as the model was saved where absent
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; its own choice where absent
     """
-    paths = find_files(files)
-    targets = {path: _prediction_path(path, Path(output)) for path in paths}
+    failures: list[str] = []
+    places = find_pairs(files, every, failures)
+    targets = {place.name: _prediction_path(place.name, Path(output)) for place in places}
     network = load_model(model, candidates, device, threads)
     make_folder("--output", output)
-    failures: list[str] = []
-    with tqdm(total=len(paths), unit="pair", disable=None) as bar:
-        for part in batches(paths):
-            pairs = {path: pair for path in part if (pair := attempt(failures, read_pair, path)) is not None}
-            for path, prediction in _match_batch(network, pairs, failures).items():
-                if attempt(failures, _write, targets[path], prediction):
-                    bar.write(describe(pairs[path], prediction))
+    moving: list[tuple[int, int]] = []
+    with tqdm(total=len(places), unit="pair", disable=None) as bar:
+        for part in batches(places):
+            pairs = {str(place): pair for place in part if (pair := attempt(failures, place.read)) is not None}
+            for where, prediction in _match_batch(network, pairs, failures).items():
+                pair = pairs[where]
+                if attempt(failures, _write, targets[pair.name], prediction):
+                    bar.write(describe(pair, prediction))
+                    moving.append((int((prediction.cluster > BACKGROUND).sum()), len(pair.source)))
             bar.update(len(part))
-    print(f"{len(paths) - len(failures)} of {len(paths)} pairs matched, predictions in {output}")
+    print(f"{len(moving)} of {len(places)} pairs matched{_shares(moving)}; predictions in {output}")
     for failure in failures:
         print(f"torchcrf-scan match: error: {failure}", file=sys.stderr)
     return 1 if failures else 0
+
+
+def _shares(moving: Sequence[tuple[int, int]]) -> str:
+    """How much moves in all: (moving, all) source points of every pair."""
+    if not moving:
+        return ""
+    in_motion, points = (sum(counts) for counts in zip(*moving, strict=True))
+    share = 100 * sum(count > 0 for count, _ in moving) / len(moving)
+    return f", something moving in {share:.1f} % of them, {100 * in_motion / max(points, 1):.2f} % of their source points"
 
 
 def describe(pair: ScanPair, prediction: PairPrediction) -> str:
@@ -68,7 +83,17 @@ def describe(pair: ScanPair, prediction: PairPrediction) -> str:
     moving = f"{len(movers)} moving: {', '.join(movers)}" if movers else "nothing moving"
     outliers = int((prediction.association[pair.source.beam] < 0).sum())
     settled = "" if prediction.converged else "; not converged"
-    return f"{pair.name}: {ego}; {moving}; {outliers} of {len(pair.source)} points outliers{settled}"
+    return f"{pair.name}: {ego}; {moving}; {outliers} of {len(pair.source)} points outliers{_unobserved(prediction)}{settled}"
+
+
+def _unobserved(prediction: PairPrediction) -> str:
+    """What of the background's motion nothing was seen of, directions being those of the second scan's frame."""
+    turn, shift = prediction.unobserved_turn, prediction.unobserved_shift
+    found = "; turn not observed" if turn is not None and turn[BACKGROUND] else ""
+    if shift is not None and shift[BACKGROUND].any():
+        x, y = (shift[BACKGROUND] * (1 if tuple(shift[BACKGROUND]) > (0, 0) else -1)).round(2) + 0.0  # + 0.0: never -0.00
+        found += f"; sliding along ({x:.2f}, {y:.2f}) not observed"
+    return found
 
 
 def _signed(value: float, digits: int) -> str:
@@ -84,7 +109,7 @@ def mover_speeds(pair: ScanPair, prediction: PairPrediction) -> list[float]:
     return [float(np.linalg.norm(velocity)) for velocity in velocities]
 
 
-def _match_batch(network: JointScanCRF, pairs: Mapping[Path, ScanPair], failures: list[str]) -> dict[Path, PairPrediction]:
+def _match_batch(network: JointScanCRF, pairs: Mapping[str, ScanPair], failures: list[str]) -> dict[str, PairPrediction]:
     """The predictions; where the batch fails, those of each pair alone, so that a bad one does not lose the others."""
     try:
         return dict(zip(pairs, network.match_pairs(list(pairs.values())), strict=True))
@@ -92,12 +117,12 @@ def _match_batch(network: JointScanCRF, pairs: Mapping[Path, ScanPair], failures
         if len(pairs) == 1:
             failures.append(f"{next(iter(pairs))}: {one_line(error)}")
             return {}
-    return {path: found for one in pairs for path, found in _match_batch(network, {one: pairs[one]}, failures).items()}
+    return {where: found for one in pairs for where, found in _match_batch(network, {one: pairs[one]}, failures).items()}
 
 
-def _prediction_path(path: Path, folder: Path) -> Path:
-    """Where the prediction of a pair file goes: nothing there yet, or an earlier prediction."""
-    target = folder / f"{path.stem}.npz"
+def _prediction_path(name: str, folder: Path) -> Path:
+    """Where the prediction of a pair goes: nothing there yet, or an earlier prediction."""
+    target = folder / f"{name}.npz"
     if target.exists():
         try:
             read_prediction(target)

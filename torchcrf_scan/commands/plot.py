@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchcrf_scan.commands.arguments import load_model
-from torchcrf_scan.data.pair_file import read_pair, read_prediction
+from torchcrf_scan.commands.arguments import load_model, read_one
+from torchcrf_scan.data.pair_file import read_prediction
 
 
-def plot(file: str, output: str, *, prediction: str | None = None, model: str | None = None) -> int:
+def plot(file: str, output: str, *, number: int | None = None, prediction: str | None = None, model: str | None = None) -> int:
     """Draws a pair with its prediction, from a file or by a model, and its annotation, as far as they are there.
 
     Args:
-        file: pair file
+        file: pair file, or log
         output: picture (.png) to write
+        number: which pair of the log, counted from 0 as in the names of its pairs
         prediction: prediction file
         model: folder of a saved model, or the name of one that the package ships; matches the pair
     """
@@ -23,7 +24,7 @@ def plot(file: str, output: str, *, prediction: str | None = None, model: str | 
         raise ValueError("--prediction: expected no --model beside it, got both")
     if Path(output).suffix.lower() != ".png":
         raise ValueError(f"--output: expected a name ending in .png, got {output}")
-    pair = read_pair(file)
+    pair = read_one(file, number)
     answer = read_prediction(prediction) if prediction is not None else None
     if model is not None:
         answer = load_model(model).match_pairs([pair])[0]

@@ -72,9 +72,23 @@ class CarmenLog(Sequence[ScanPair]):
             return [self[k] for k in range(*index.indices(len(self)))]
         k = range(len(self))[index]
         source, target = self.scans[k], self.scans[k + 1]
-        name = self.path.name.split(".")[0]
         seconds = max(target.stamp - source.stamp, 1e-3)  # logs are not always in order
-        return ScanPair(source.scan, target.scan, seconds, name=f"{name}_{k:05d}", sequence=name, origin=self.path.name)
+        name, sequence = self.pair_name(k), log_name(self.path)
+        return ScanPair(source.scan, target.scan, seconds, name=name, sequence=sequence, origin=self.path.name)
+
+    def pair_name(self, number: int) -> str:
+        """The name of a pair: the log's and its number."""
+        return f"{log_name(self.path)}_{number:05d}"
+
+
+def is_log(path: str | Path) -> bool:
+    """Whether a file is a CARMEN log by its name: `.log` or `.log.gz`."""
+    return Path(path).name.endswith((".log", ".log.gz"))
+
+
+def log_name(path: Path) -> str:
+    """The name of a recording: the file's, without `.log` and `.gz`."""
+    return path.name.removesuffix(".gz").removesuffix(".log")
 
 
 def read_text(path: Path) -> str:
