@@ -159,6 +159,10 @@ class PairPrediction:
         motions: (K+1, 3) `T_target_source` of background and movers; the sensor moved by the inverse of row 0.
         association_confidence, cluster_confidence: (n,) in [0, 1].
         converged: whether the labels had settled when the iterations ended.
+        covariances: (K+1, 3, 3) of the motions' (theta, tx, ty), radians and metres; large where nothing was observed.
+        unobserved_turn: (K+1,) bool, nothing is known of the rotation.
+        unobserved_shift: (K+1, 2) unit direction, in the target frame, along which the cluster may have slid unseen; 0: none.
+            These three are None where the method does not say.
     """
 
     association: Ints
@@ -167,3 +171,6 @@ class PairPrediction:
     association_confidence: Floats
     cluster_confidence: Floats
     converged: bool
+    covariances: Floats | None = None
+    unobserved_turn: Bools | None = None
+    unobserved_shift: Floats | None = None

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_pairs import make_pair, make_prediction, make_small, perfect, perturbed, random_labels, truth_of
 
-from torchcrf_scan.counterparts import match_movers
-from torchcrf_scan.evaluation.metrics import edit_distance, relabel, score_pair
+from torchcrf_scan.counterparts import match_movers, relabel
+from torchcrf_scan.evaluation.metrics import edit_distance, score_pair
 from torchcrf_scan.scan import ScanPair
 
 
@@ -82,9 +82,16 @@ def test_ignored_and_lost_beams_change_nothing() -> None:
     prediction = perturbed(pair, rng)
     unseen = truth_of(pair).ignore | ~pair.source.to_beams(np.ones(len(pair.source), bool), False)
     other = dataclasses.replace(
-        prediction, association=np.where(unseen, 0, prediction.association), cluster=np.where(unseen, 3, prediction.cluster)
+        prediction,
+        association=np.where(unseen, 0, prediction.association),
+        cluster=np.where(unseen, 3, prediction.cluster),
+        association_confidence=np.where(unseen, 0.0, prediction.association_confidence),
+        cluster_confidence=np.where(unseen, 0.0, prediction.cluster_confidence),
     )
     assert score_pair(pair, other) == score_pair(pair, prediction)
+    one, same = score_pair(pair, other).sureness, score_pair(pair, prediction).sureness
+    for name in ("association", "association_right", "cluster", "cluster_right"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
 
 
 def test_errors_name_what_is_wrong(small: ScanPair) -> None:

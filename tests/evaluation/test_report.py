@@ -1,6 +1,7 @@
 import csv
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import (
     PUBLISHED_HEADING,
     PUBLISHED_NOTE,
+    SURENESS_NOTE,
     Table,
     association_table,
     detection_table,
@@ -17,6 +19,7 @@ from torchcrf_scan.evaluation.report import (
     estimation_table,
     overview_table,
     report,
+    sureness_table,
 )
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
@@ -35,11 +38,18 @@ def scores() -> dict[str, list[PairScore]]:
     return {"right": [score_pair(pair, right)] * 2, "nothing": [score_pair(pair, nothing)]}
 
 
+@pytest.fixture
+def sure_scores(scores: dict[str, list[PairScore]]) -> list[PairScore]:
+    """Three pairs whose background motions have known errors."""
+    score = scores["right"][0]
+    return [replace(score, sureness=replace(score.sureness, nees=nees)) for nees in (1.0, 1.0, 100.0)]
+
+
 def test_tables_have_one_row_per_method(scores: dict[str, list[PairScore]]) -> None:
     for table in report(scores):
         assert [row[0] for row in table.rows] == ["right", "nothing"]
         assert table.columns[0] == "method"
-    assert [table.title.split(":")[0] for table in report(scores)] == ["Overview", "Table I", "Table II", "Table III"]
+    assert [table.title.split(":")[0] for table in report(scores)] == ["Overview", "Table I", "Table II", "Table III", "How sure"]
 
 
 def cell(table: Table, method: str, column: str) -> object:
@@ -83,6 +93,31 @@ def test_tables_have_the_columns_of_the_paper_and_more(scores: dict[str, list[Pa
     assert cell(association_table(scores), "right", "within +-2 (%)") == 100
 
 
+def test_how_sure_has_the_figures_of_the_summary(scores: dict[str, list[PairScore]]) -> None:
+    table = sureness_table(scores)
+    assert table.columns == (
+        "method",
+        "associations, calibration error (%)",
+        "clusters, calibration error (%)",
+        "background NEES within 95 % (%)",
+        "mean NEES",
+        "low",
+        "high",
+    )
+    assert cell(table, "right", "associations, calibration error (%)") == 0
+    assert cell(table, "nothing", "clusters, calibration error (%)") == summarise(scores["nothing"])["cluster_ece"] == 87.5
+    assert table.to_markdown().splitlines()[2] == SURENESS_NOTE
+    assert table.to_markdown().splitlines()[-1] == "| nothing | 87.5 | 87.5 | - | - | - | - |"
+
+
+def test_how_sure_tells_of_covariances(sure_scores: list[PairScore]) -> None:
+    """Errors of one, one and ten standard deviations: two are within the quantile, the mean is too large by far."""
+    table = sureness_table({"sure": sure_scores})
+    assert cell(table, "sure", "background NEES within 95 % (%)") == pytest.approx(100 * 2 / 3)
+    assert cell(table, "sure", "mean NEES") == pytest.approx(102 / 3)
+    assert cell(table, "sure", "low") < 3 < cell(table, "sure", "high") < 102 / 3
+
+
 def test_times_are_medians_in_milliseconds(scores: dict[str, list[PairScore]]) -> None:
     table = report(scores, seconds={"right": [0.1, 0.3, 5.0], "another": [1.0]})[0]
     assert table.columns == (*overview_table(scores).columns, "time (ms)")
@@ -94,8 +129,9 @@ def test_times_are_medians_in_milliseconds(scores: dict[str, list[PairScore]]) -
 
 def test_published_numbers_stand_at_the_right_of_their_row(scores: dict[str, list[PairScore]]) -> None:
     rows = dict.fromkeys(("ICP", "ICP, tuned", "K-Means (ICP)", "joint"), scores["right"])
-    overview, association, detection, estimation = report(rows, published=True)
+    overview, association, detection, estimation, sureness = report(rows, published=True)
     assert overview == overview_table(rows)
+    assert sureness.to_markdown() == sureness_table(rows).to_markdown()
     assert cell(association, "ICP, tuned", f"{PUBLISHED_HEADING}accuracy (%)") == 69.19
     assert cell(association, "joint", f"{PUBLISHED_HEADING}SED") == 96.13
     assert math.isnan(cell(association, "ICP", f"{PUBLISHED_HEADING}ratio (%)"))

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from made_pairs import PREDICTORS, all_outliers, make_pair, make_prediction, make_small, perfect, perturbed, random_labels, truth_of
 
 from torchcrf_scan.data.pair_file import read_pair, write_pair
+from torchcrf_scan.evaluation.calibration import expected_calibration_error, rightness
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.scan import PairPrediction, ScanPair
@@ -73,7 +74,8 @@ def assert_agrees_with_scorer(folder: Path, predict: Callable[[ScanPair, np.rand
     for path in sorted(folder.glob("*.npz")):
         pair = read_pair(path)
         prediction = predict(pair, rng)
-        np.savez(predictions / path.name, **dataclasses.asdict(prediction))  # also what write_prediction refuses
+        given = {key: value for key, value in dataclasses.asdict(prediction).items() if value is not None}
+        np.savez(predictions / path.name, **given)  # also what write_prediction refuses
         scores.append(score_pair(pair, prediction))
     expected = run_scorer(folder, predictions)
     groups = {name: [score for score in scores if score.sequence == name] for name in {score.sequence for score in scores}}
@@ -170,6 +172,7 @@ def test_empty_scans_have_figures(n: int, m: int) -> None:
     assert summary["cluster_sed2"] == 0
     assert math.isnan(summary["target_distance"])
     assert math.isnan(summary["association_inlier_accuracy_skipped"])
+    assert math.isnan(summary["cluster_ece"]) == (score.cluster.points == 0)
 
 
 def test_undefined_precision_is_zero_or_skipped(small: ScanPair) -> None:
@@ -209,3 +212,63 @@ def test_both_bounds_of_a_good_ego_motion(small: ScanPair, error: tuple[float, f
 def test_no_scores_are_refused() -> None:
     with pytest.raises(ValueError, match="scores: expected at least one pair"):
         summarise([])
+
+
+def sure(pair: ScanPair, seed: int) -> PairPrediction:
+    """A prediction that tells how sure it is of everything."""
+    rng = np.random.default_rng(seed)
+    prediction, n = perturbed(pair, rng), pair.source.n_beams
+    covariances = np.tile(0.01**2 * np.eye(3), (len(prediction.motions), 1, 1))
+    return dataclasses.replace(
+        prediction, association_confidence=rng.random(n), cluster_confidence=rng.random(n), covariances=covariances
+    )
+
+
+def test_calibration_errors_are_of_all_annotated_returns() -> None:
+    pairs = [make_pair(60, 50, 2, np.random.default_rng(seed), drop=0.1) for seed in range(3)]
+    answers = [sure(pair, seed) for seed, pair in enumerate(pairs)]
+    summary = summarise([score_pair(pair, answer) for pair, answer in zip(pairs, answers, strict=True)])
+    confidences, right = [], []
+    for pair, answer in zip(pairs, answers, strict=True):
+        found = rightness(pair, answer)
+        confidences.append(answer.association_confidence[pair.source.beam][found.known])
+        right.append(found.within[found.known])
+    expected = expected_calibration_error(np.concatenate(confidences), np.concatenate(right))
+    assert summary["association_ece"] == pytest.approx(100 * expected)
+    assert 0 < summary["cluster_ece"] < 100
+
+
+def test_a_sure_answer_errs_by_its_mistakes(small: ScanPair) -> None:
+    """Where everything is told with confidence 1, the calibration error is the share of what is wrong."""
+    association = np.array([0, 2, 4, 6, -1, 5, 6, 7, 8, -1, -1, 3])
+    cluster = np.array([0, 0, 0, 0, 2, 2, 2, 2, 2, -1, -1, 5])
+    summary = summarise([score_pair(small, make_prediction(association, cluster, np.zeros((6, 3))))])
+    assert summary["association_ece"] == pytest.approx(100 - summary["association_within_2"])
+    assert summary["cluster_ece"] == pytest.approx(100 - summary["cluster_accuracy"])
+
+
+def test_normalised_errors_by_hand(small: ScanPair) -> None:
+    """Errors (0.01, 0.02, 0) under deviations of 0.01; then none, and no covariance."""
+    motions = truth_of(small).motions + np.array([0.01, 0.02, 0.0])
+    off = dataclasses.replace(perfect(small), motions=motions, covariances=np.tile(1e-4 * np.eye(3), (2, 1, 1)))
+    right = dataclasses.replace(off, motions=truth_of(small).motions)
+    summary = summarise([score_pair(small, answer) for answer in (off, right, right, perfect(small))])
+    assert summary["nees_pairs"] == 3
+    assert summary["nees_mean"] == pytest.approx(5 / 3)
+    assert summary["nees_covered"] == 100
+    assert summary["nees_low"] == pytest.approx(2.70 / 3, abs=1e-3)  # chi2(9), tables
+    assert summary["nees_high"] == pytest.approx(19.02 / 3, abs=1e-2)
+    far = dataclasses.replace(off, motions=truth_of(small).motions + 0.1)
+    assert summarise([score_pair(small, far), score_pair(small, right)])["nees_covered"] == 50
+
+
+def test_nothing_is_said_of_covariances_that_are_none(small: ScanPair) -> None:
+    given = dataclasses.replace(perfect(small), covariances=np.tile(np.eye(3), (2, 1, 1)))
+    assert score_pair(small, given).sureness.nees == 0
+    unknown = dataclasses.replace(small, annotation=dataclasses.replace(truth_of(small), motions=np.full((2, 3), np.nan)))
+    silent = dataclasses.replace(given, motions=np.full((2, 3), np.nan))
+    flat = dataclasses.replace(given, covariances=np.zeros((2, 3, 3)))
+    for pair, answer in ((small, perfect(small)), (unknown, given), (small, silent), (small, flat)):
+        summary = summarise([score_pair(pair, answer)])
+        assert summary["nees_pairs"] == 0
+        assert all(math.isnan(summary[key]) for key in ("nees_covered", "nees_mean", "nees_low", "nees_high"))

@@ -34,6 +34,7 @@ _SCAN_KEYS = ("source_ranges", "source_bearings", "target_ranges", "target_beari
 _ANNOTATION_KEYS = ("association", "cluster", "motions", "body", "ignore")
 _TEXT_KEYS = ("sequence", "source")
 _PAIR_KEYS = _SCAN_KEYS + _ANNOTATION_KEYS + _SENSOR_KEYS + _TEXT_KEYS
+_CERTAINTY_KEYS = ("covariances", "unobserved_turn", "unobserved_shift")  # all of them or none
 _PREDICTION_KEYS = ("association", "cluster", "motions", "association_confidence", "cluster_confidence", "converged")
 
 
@@ -130,7 +131,7 @@ def read_prediction(path: str | Path) -> PairPrediction:
         ValueError: not an `.npz`, truncated, object arrays, a key that is missing or wrong (the message names it).
         OSError: the file cannot be opened.
     """
-    return _parse_prediction(_load(Path(path), _PREDICTION_KEYS))
+    return _parse_prediction(_load(Path(path), (*_PREDICTION_KEYS, *_CERTAINTY_KEYS)))
 
 
 def write_prediction(path: str | Path, prediction: PairPrediction) -> None:
@@ -139,9 +140,10 @@ def write_prediction(path: str | Path, prediction: PairPrediction) -> None:
     Raises:
         ValueError: a prediction that `read_prediction` would refuse. No file is written.
     """
-    fields = _Fields(Path(path), {key: np.asarray(getattr(prediction, key), order="C") for key in _PREDICTION_KEYS})
+    keys = [key for key in (*_PREDICTION_KEYS, *_CERTAINTY_KEYS) if getattr(prediction, key) is not None]
+    fields = _Fields(Path(path), {key: np.asarray(getattr(prediction, key), order="C") for key in keys})
     parsed = _parse_prediction(fields)
-    _save(_Fields(fields.path, {key: np.asarray(getattr(parsed, key)) for key in _PREDICTION_KEYS}))
+    _save(_Fields(fields.path, {key: np.asarray(getattr(parsed, key)) for key in keys}))
 
 
 def _parse_pair(fields: _Fields) -> ScanPair:
@@ -205,7 +207,20 @@ def _parse_prediction(fields: _Fields) -> PairPrediction:
         confidence = fields.get(key, "float", len(association))
         fields.require(key, confidence, (confidence >= 0) & (confidence <= 1), "confidences in [0, 1]")
         confidences.append(confidence)
-    return PairPrediction(association, cluster, motions, confidences[0], confidences[1], converged)
+    certainty = _parse_certainty(fields, len(motions)) if any(key in fields for key in _CERTAINTY_KEYS) else {}
+    return PairPrediction(association, cluster, motions, confidences[0], confidences[1], converged, **certainty)
+
+
+def _parse_certainty(fields: _Fields, clusters: int) -> dict[str, NDArray[Any]]:
+    covariances = fields.get("covariances", "float", clusters, 3, 3)
+    fields.require("covariances", covariances, np.isfinite(covariances), "finite covariances")
+    shift = fields.get("unobserved_shift", "float", clusters, 2)
+    fields.require("unobserved_shift", shift, np.isfinite(shift), "finite directions")
+    return {
+        "covariances": covariances,
+        "unobserved_turn": fields.get("unobserved_turn", "bool", clusters),
+        "unobserved_shift": shift,
+    }
 
 
 def _is_return(scan: Scan) -> Bools:

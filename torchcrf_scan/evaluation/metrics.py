@@ -6,12 +6,13 @@ pair and prediction files themselves. Movers are matched to the true ones by max
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from rapidfuzz.distance import Levenshtein
 
-from torchcrf_scan.counterparts import match_movers, movers_in_order
+from torchcrf_scan.counterparts import match_movers, relabel
+from torchcrf_scan.evaluation.calibration import Sureness
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 
@@ -108,6 +109,7 @@ class PairScore:
         has_ego_truth: whether the background's true motion is known.
         ego_rotation, ego_translation: error of the background motion, radians and metres; NaN when it or its truth is unknown.
         objects: background and movers that have inlier points.
+        sureness: how sure the prediction was of what. Takes no part in comparisons.
         name, sequence: of the pair.
     """
 
@@ -125,6 +127,7 @@ class PairScore:
     ego_rotation: float
     ego_translation: float
     objects: tuple[ObjectScore, ...]
+    sureness: Sureness = field(compare=False, repr=False)
     name: str = ""
     sequence: str = ""
 
@@ -165,22 +168,10 @@ def score_pair(pair: ScanPair, prediction: PairPrediction) -> PairScore:
         ego_rotation=rotation,
         ego_translation=translation,
         objects=_object_scores(truth, prediction, cluster, predicted_cluster, points, matched),
+        sureness=Sureness.of(pair, prediction),
         name=pair.name,
         sequence=pair.sequence,
     )
-
-
-def relabel(predicted: Ints, cluster: Ints, matched: dict[int, int]) -> Ints:
-    """(N,) predicted labels in the numbers of the true ones; unmatched movers get numbers that no true one has."""
-    out = predicted.copy()
-    number = {theirs: ours for ours, theirs in matched.items()}
-    free = int(cluster.max(initial=0)) + 1
-    for mover in movers_in_order(predicted).tolist():
-        if mover not in number:
-            number[mover] = free
-            free += 1
-        out[predicted == mover] = number[mover]
-    return out
 
 
 def edit_distance(labels: Ints, others: Ints, substitution: int) -> int:

@@ -1,4 +1,4 @@
-"""Tables of methods: the paper's I (association), II (motion detection), III (motion estimation), an overview, differences."""
+"""Tables of methods: the paper's I (association), II (detection), III (motion estimation), an overview, how sure, differences."""
 
 from __future__ import annotations
 
@@ -78,6 +78,18 @@ ESTIMATION: tuple[Column, ...] = (
     ("mover translation (m)", "mover_motion_translation", 3),
     ("mover at centroid (m)", "mover_motion_centroid", 3),
     ("movers", "mover_motion_objects", 0),
+)
+SURENESS: tuple[Column, ...] = (
+    ("associations, calibration error (%)", "association_ece", 1),
+    ("clusters, calibration error (%)", "cluster_ece", 1),
+    ("background NEES within 95 % (%)", "nees_covered", 1),
+    ("mean NEES", "nees_mean", 2),
+    ("low", "nees_low", 2),
+    ("high", "nees_high", 2),
+)
+SURENESS_NOTE = (
+    "Calibration errors are expected ones, over all returns; an association is right within +-2. NEES: squared error of the "
+    "background's motion over its covariance; 95 % should be within the quantile, the mean between low and high."
 )
 
 
@@ -180,8 +192,17 @@ def estimation_table(scores: Scores, *, published: bool = False) -> Table:
     return _with_published(table, paper.ESTIMATION) if published else table
 
 
+def sureness_table(scores: Scores) -> Table:
+    """Whether confidences and covariances mean what they say.
+
+    Raises:
+        ValueError: a method without scores.
+    """
+    return replace(_table("How sure", SURENESS, scores), note=SURENESS_NOTE)
+
+
 def report(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | None = None, published: bool = False) -> list[Table]:
-    """The overview and the Tables I, II, III of `{method: its scores}`, methods in the given order.
+    """The overview, the Tables I, II, III and how sure, of `{method: its scores}`, methods in the given order.
 
     Args:
         scores: of the pairs, by method.
@@ -192,7 +213,8 @@ def report(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | None = No
         ValueError: a method without scores.
     """
     tables = (association_table, detection_table, estimation_table)
-    return [overview_table(scores, seconds=seconds), *(table(scores, published=published) for table in tables)]
+    paper_tables = (table(scores, published=published) for table in tables)
+    return [overview_table(scores, seconds=seconds), *paper_tables, sureness_table(scores)]
 
 
 def differences_table(reference: str, scores: Scores, weights: Ints) -> Table:

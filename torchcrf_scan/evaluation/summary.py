@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from torchcrf_scan.evaluation.calibration import consistency, expected_calibration_error
 from torchcrf_scan.evaluation.metrics import LabelScore, ObjectScore, PairScore
 
 EGO_TRANSLATION, EGO_ROTATION = 0.05, 0.01745  # metres, radians (1 deg): a good ego motion
@@ -24,9 +27,12 @@ def summarise(scores: Sequence[PairScore]) -> dict[str, float]:
     - `motion_*`, `background_motion_*`, `mover_motion_*`: `rotation`, `translation`, `centroid` errors, pooled over the
       correctly clustered objects (A-23), and `objects`, their number.
     - `found_mover_centroid_median`: over the movers found.
+    - `association_ece` (right within two target beams), `cluster_ece`: expected calibration errors, percent of all returns.
+    - `nees_pairs` whose background motion and covariance are known; over these `nees_covered`, percent within the 95 % quantile
+      of the chi-square, `nees_mean`, and `nees_low`, `nees_high`, where 95 % of such means lie if the covariances are right.
 
     An undefined precision, recall or accuracy counts as 0; the key with `_skipped` leaves such pairs out. Keys with `_skipped`,
-    `target_distance` and errors are NaN when there is nothing to average; no other key ever is.
+    `target_distance`, errors, `_ece` and `nees_` are NaN when there is nothing to average; no other key ever is.
 
     Raises:
         ValueError: no scores.
@@ -40,6 +46,7 @@ def summarise(scores: Sequence[PairScore]) -> dict[str, float]:
         **_moving_summary(scores),
         **_ego_summary(scores),
         **_motion_summary(scores),
+        **_sureness_summary(scores),
     }
 
 
@@ -139,4 +146,22 @@ def _error_summary(prefix: str, objects: Sequence[ObjectScore], is_meant: Callab
         f"{prefix}_translation": _mean(error.translation for error in errors),
         f"{prefix}_centroid": _mean(error.centroid for error in errors),
         f"{prefix}_objects": float(len(errors)),
+    }
+
+
+def _sureness_summary(scores: Sequence[PairScore]) -> dict[str, float]:
+    def pooled(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(score.sureness, name) for score in scores])
+
+    nees = np.array([score.sureness.nees for score in scores])
+    nees = nees[np.isfinite(nees)]
+    found = consistency(nees) if len(nees) else None
+    return {
+        "association_ece": 100 * expected_calibration_error(pooled("association"), pooled("association_right")),
+        "cluster_ece": 100 * expected_calibration_error(pooled("cluster"), pooled("cluster_right")),
+        "nees_pairs": float(len(nees)),
+        "nees_covered": 100 * found.within if found else float("nan"),
+        "nees_mean": found.mean if found else float("nan"),
+        "nees_low": found.low if found else float("nan"),
+        "nees_high": found.high if found else float("nan"),
     }

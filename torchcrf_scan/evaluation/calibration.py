@@ -1,0 +1,187 @@
+"""Whether confidences and covariances mean what they say: calibration error, reliability, normalised estimation error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import chi2
+
+from torchcrf_scan.counterparts import match_movers, relabel
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.scan import BACKGROUND, Bools, Floats, PairPrediction, ScanPair
+
+BINS = 15
+MOTION_FREEDOM = 3  # theta, tx, ty
+
+
+@dataclass(frozen=True, slots=True)
+class Bin:
+    """Answers given with confidences from `low` to `high`, the latter belonging to the next bin.
+
+    Attributes:
+        low, high: bounds of the confidence.
+        count: answers in the bin.
+        confidence: their mean confidence. accuracy: share of them that is right. Both NaN for none.
+    """
+
+    low: float
+    high: float
+    count: int
+    confidence: float
+    accuracy: float
+
+
+def reliability(confidence: ArrayLike, is_right: ArrayLike, bins: int = BINS) -> tuple[Bin, ...]:
+    """The reliability table: `bins` equally wide bins over [0, 1].
+
+    Args:
+        confidence: (P,) in [0, 1]. is_right: (P,) bool.
+
+    Raises:
+        ValueError: other shapes, confidences outside [0, 1], no bins.
+    """
+    confidences, right = np.asarray(confidence, dtype=np.float64), np.asarray(is_right, dtype=bool)
+    if confidences.ndim != 1 or confidences.shape != right.shape:
+        raise ValueError(f"is_right: expected one for every confidence (P,), got {right.shape} for {confidences.shape}")
+    if not ((confidences >= 0) & (confidences <= 1)).all():
+        raise ValueError("confidence: expected numbers in [0, 1], got others")
+    if bins < 1:
+        raise ValueError(f"bins: expected at least 1, got {bins}")
+    place = np.minimum((confidences * bins).astype(np.int64), bins - 1)
+    edges = np.linspace(0.0, 1.0, bins + 1)
+    table = []
+    for k in range(bins):
+        inside = place == k
+        count = int(inside.sum())
+        means = (float(confidences[inside].mean()), float(right[inside].mean())) if count else (np.nan, np.nan)
+        table.append(Bin(float(edges[k]), float(edges[k + 1]), count, *means))
+    return tuple(table)
+
+
+def expected_calibration_error(confidence: ArrayLike, is_right: ArrayLike, bins: int = BINS) -> float:
+    """Mean over all answers of |confidence - accuracy| of their bin; NaN for no answers. Arguments as in `reliability`."""
+    table = [row for row in reliability(confidence, is_right, bins) if row.count]
+    if not table:
+        return float("nan")
+    return sum(row.count * abs(row.confidence - row.accuracy) for row in table) / sum(row.count for row in table)
+
+
+def normalised_error(estimate: Floats, truth: Floats, covariance: Floats) -> Floats:
+    """NEES e^T P^-1 e of motions, a chi-square number of three degrees of freedom if the covariance P is right.
+
+    estimate, truth: (..., 3). covariance: (..., 3, 3). Returns (...,), NaN where the truth is.
+    """
+    error = np.concatenate([se2.wrap(estimate[..., :1] - truth[..., :1]), estimate[..., 1:] - truth[..., 1:]], axis=-1)
+    scale = np.sqrt(np.einsum("...ii->...i", covariance))  # radians and metres of all sizes: solve for the correlations
+    correlation = covariance / (scale[..., :, None] * scale[..., None, :])
+    scaled = (error / scale)[..., None]
+    return (scaled * np.linalg.solve(correlation, scaled)).sum((-1, -2))
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """What many normalised errors say of their covariances.
+
+    Attributes:
+        count: errors.
+        mean: their mean; low, high: where 95 % of such means lie if the covariances are right.
+        median: over the median of the chi-square distribution.
+        within: share of the errors below its 95 % quantile.
+    """
+
+    count: int
+    mean: float
+    low: float
+    high: float
+    median: float
+    within: float
+
+
+def consistency(nees: ArrayLike, freedom: int = MOTION_FREEDOM, level: float = 0.95) -> Consistency:
+    """Compares normalised errors (P,) with the chi-square distribution. Raises ValueError for none."""
+    values = np.asarray(nees, dtype=np.float64)
+    if values.ndim != 1 or not len(values):
+        raise ValueError(f"nees: expected at least one number (P,), got {values.shape}")
+    n = len(values)
+    low, high = chi2.ppf([(1 - level) / 2, (1 + level) / 2], n * freedom) / n
+    return Consistency(
+        count=n,
+        mean=float(values.mean()),
+        low=float(low),
+        high=float(high),
+        median=float(np.median(values) / chi2.median(freedom)),
+        within=float((values < chi2.ppf(level, freedom)).mean()),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Rightness:
+    """Which answers of a pair are right, by valid return of the source.
+
+    Attributes:
+        known: (N,) returns that somebody annotated; the others do not count.
+        exact: (N,) the true target beam, or an outlier that is one.
+        within: (N,) at most `tolerance` target beams off, or an outlier that is one.
+        cluster: (N,) the true cluster, movers matched by overlap.
+    """
+
+    known: Bools
+    exact: Bools
+    within: Bools
+    cluster: Bools
+
+
+def rightness(pair: ScanPair, prediction: PairPrediction, tolerance: int = 2) -> Rightness:
+    """Compares a prediction with the pair's annotation. Raises ValueError for a pair without one."""
+    if pair.annotation is None:
+        raise ValueError(f"pair {pair.name!r}: expected an annotation, got none")
+    beam = pair.source.beam
+    known = ~pair.annotation.ignore[beam]
+    truth, answer = pair.annotation.association[beam], prediction.association[beam]
+    is_same_kind = (truth < 0) == (answer < 0)
+    off = np.where(truth < 0, 0, np.abs(truth - answer))
+    cluster, found = pair.annotation.cluster[beam], prediction.cluster[beam]
+    numbered = relabel(found, cluster, match_movers(cluster[known], found[known]))
+    return Rightness(known, is_same_kind & (off == 0), is_same_kind & (off <= tolerance), numbered == cluster)
+
+
+@dataclass(frozen=True, slots=True)
+class Sureness:
+    """How sure the answer for a pair was, beside whether it was right: P returns that somebody annotated.
+
+    Attributes:
+        association, cluster: (P,) confidences.
+        association_right, cluster_right: (P,) bool; an association is right within two target beams.
+        nees: normalised error of the background's motion; NaN where the method gives no covariance or a motion is unknown.
+    """
+
+    association: Floats
+    association_right: Bools
+    cluster: Floats
+    cluster_right: Bools
+    nees: float
+
+    @classmethod
+    def of(cls, pair: ScanPair, prediction: PairPrediction) -> Sureness:
+        """Compares a prediction with the pair's annotation. Raises ValueError for a pair without one."""
+        right = rightness(pair, prediction)
+        beam = pair.source.beam[right.known]
+        return cls(
+            association=prediction.association_confidence[beam],
+            association_right=right.within[right.known],
+            cluster=prediction.cluster_confidence[beam],
+            cluster_right=right.cluster[right.known],
+            nees=background_nees(pair, prediction),
+        )
+
+
+def background_nees(pair: ScanPair, prediction: PairPrediction) -> float:
+    """Normalised error of the background's motion; NaN where there is none to tell."""
+    if pair.annotation is None or prediction.covariances is None:
+        return float("nan")
+    covariance, motions = prediction.covariances[BACKGROUND], (prediction.motions[BACKGROUND], pair.annotation.motions[BACKGROUND])
+    if not np.isfinite(motions).all() or np.linalg.eigvalsh(covariance)[0] <= 0:
+        return float("nan")
+    return float(normalised_error(*motions, covariance))

@@ -1,0 +1,302 @@
+"""How sure the answer is: covariances of the motions, directions that nothing was seen of, and calibrated confidences.
+
+A motion's errors come from more than the sensor's noise: returns sample a surface, surfaces bend, neighbouring beams share a jolt,
+and the fit stops short. So what the residuals say stands beside what the sensor says, and the covariance is that of a sum of
+correlated scores (a sandwich estimator). What the *noise* of the surface's direction pretends to know must not count: along a
+corridor every noisy tangent seems to hold the motion back. Surfaces are therefore described anew, from stretches long beside noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.geometry.kabsch import safe_atan2
+from torchcrf_scan.inference.motion import Support
+
+LEAST_SHARE = 0.02  # of the best possible information per point; in a direction with less the motion counts as not observed
+STRETCH, STEPS = 10.0, 2.0  # a surface's direction comes from the points within so many noises and steps to the next point
+NEIGHBOURS = 8  # on either side, at most
+RUN = 48  # neighbouring points whose errors may go together: a jolt lasts several degrees
+NOTHING = 1e-3  # of what a point says, so that no matrix is singular
+TINY = 1e-6  # of the scene's reach: the least noise
+MOST_CERTAIN = -50.0  # log-beliefs below this are as good as impossible
+WITHIN = 2  # target points; an association this near is the same answer, since annotations err by one themselves
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """How well the motions of a batch are known.
+
+    A small motion away from cluster c's own is (theta L, x, y): a turn about the centroid of its moved points, times their root
+    mean square distance L from it, then a shift in the target frame; all in metres. `directions` are given in these.
+
+    Attributes:
+        covariance: (B, C, 3, 3) of (theta, tx, ty), radians and metres; large but finite where nothing is observed.
+        information: (B, C, 3) ascending, what a point says of each of the `directions`, 1 = as much as a point can say of a shift.
+            No gradient.
+        directions: (B, C, 3, 3), row d is the unit direction of information[..., d]. No gradient.
+    """
+
+    covariance: Tensor
+    information: Tensor
+    directions: Tensor
+
+    @property
+    def degenerate(self) -> Tensor:
+        """(B, C, 3) bool, the directions in which the motion is not observed."""
+        return self.information < LEAST_SHARE
+
+    @property
+    def is_turn_unobserved(self) -> Tensor:
+        """(B, C) bool, whether nothing is known of the rotation: no points, one point, a pole, a tube seen from its middle."""
+        return self._unobserved[..., 0, 0] > 0.5
+
+    @property
+    def unobserved_shift(self) -> Tensor:
+        """(B, C, 2) unit vector, in the target frame, along which the cluster may have slid unseen (a corridor's, a car's side).
+
+        0 where there is none; where no shift is observed at all, any of the directions.
+        """
+        values, vectors = torch.linalg.eigh(self._unobserved[..., 1:, 1:])
+        return vectors[..., -1] * (values[..., -1:] > 0.5)
+
+    @property
+    def _unobserved(self) -> Tensor:
+        """(B, C, 3, 3) projection onto the degenerate directions."""
+        rows = self.directions * self.degenerate[..., None]
+        return rows.mT @ rows
+
+    def scaled(self, factor: Tensor) -> Uncertainty:
+        """The same in another unit of length, a factor (B,) a pair."""
+        unit = torch.stack([torch.ones_like(factor), factor, factor], -1)[:, None]  # (B, 1, 3)
+        return replace(self, covariance=self.covariance * unit[..., None] * unit[..., None, :])
+
+    def inflated(self, factor: Tensor) -> Uncertainty:
+        """All covariances times a factor ()."""
+        return replace(self, covariance=self.covariance * factor)
+
+
+def motion_covariance(
+    source: Tensor, support: Support, motions: Tensor, *, metric: str, scale: Tensor, noise: Tensor
+) -> Uncertainty:
+    """Covariance of the motions that `motion.estimate` fits, and what they leave open.
+
+    With the score g_i = w_i J_i^T M_i r_i of every point and H = sum_i w_i J_i^T M_i J_i, it is H^-1 K H^-1 where K sums
+
+        v sum_i w_i^2 J_i^T M_i J_i                          independent errors, v the larger of two returns' noise and what is left
+        1 / RUN sum over runs of points of (sum g) (sum g)^T     errors that neighbours share
+        (sum_i g_i) (sum_i g_i)^T                            the step that is still to be made: the fit stopped before.
+
+    It counts independent errors up to twice and what the choice of partners hides not at all; `Calibration.covariance_factor`
+    makes up for both. In a direction of which the points say less than `LEAST_SHARE`, only a prior is left: no point moves farther
+    than the scene reaches, and a rotation is any. Differentiable at a fixed choice of these directions. O(B C N).
+
+    Args:
+        source: (B, N, 2) in beam order, N >= 1. support: of the last fit. motions: (B, C, 3) that came of it.
+        metric: `point`, else point-to-line: what holds a motion is the distance across the surface alone.
+        scale: () or (B,) residual at which a robust weight has fallen to a half. noise: (B,) standard deviation of a return.
+            Both in the unit of the points.
+    """
+    reach = torch.linalg.vector_norm(source, dim=-1).detach().amax(-1).clamp(min=1e-3)  # (B,)
+    noise = noise.maximum(TINY * reach)
+    at = Linearisation.of(source, support, motions, metric, scale, noise)
+    total = at.weights.sum(-1).clamp(min=1e-9)  # (B, C)
+    score = (at.jacobian * (at.weights[..., None] * at.residual)[..., None]).sum(-2)  # (B, C, N, 3)
+    step = score.sum(-2)
+    spread = (at.weights * (at.residual**2).sum(-1)).sum(-1) / (at.weights * at.freedom).sum(-1).clamp(min=1e-9)
+    variance = torch.maximum(2 * noise[:, None] ** 2, spread)[..., None, None].double()  # (B, C, 1, 1)
+    apart = torch.einsum("bcn,bcnia,bcnid->bcad", at.weights**2, at.jacobian, at.jacobian).double()
+    together = shared_scores(score) + step[..., :, None] * step[..., None, :]
+    identity = torch.eye(3, dtype=torch.float64, device=source.device)
+    meat = variance * (apart + NOTHING * identity) + together
+
+    normal = torch.einsum("bcn,bcnia,bcnid->bcad", at.weights, at.jacobian, at.jacobian).double() / total[..., None, None]
+    information, vectors = torch.linalg.eigh(normal.detach())
+    seen = vectors * (information >= LEAST_SHARE)[..., None, :]
+    keep = seen @ vectors.mT  # projection onto what is observed
+    pretended = 0.0 if metric == "point" else LEAST_SHARE  # by what is left of the tangents' noise, and by steps along the surface
+    bread = keep @ (normal - pretended * identity) @ keep * total[..., None, None]
+    length = at.length.double()
+    prior = torch.stack([3 / (torch.pi * length) ** 2, *(1 / reach[:, None] ** 2).expand(2, *length.shape)], -1).diag_embed()
+    local = torch.linalg.inv(bread @ torch.linalg.inv(meat) @ bread + prior)
+    covariance = about_origin(local, length, (motions[..., 1:] - at.centre).double())
+    return Uncertainty(covariance.to(source), information.to(source), vectors.mT.to(source))
+
+
+@dataclass(frozen=True, slots=True)
+class Linearisation:
+    """The fit's residuals near the motions, as functions of (theta L, x, y).
+
+    Attributes:
+        weights: (B, C, N) of the points, robust where the fit's are.
+        residual: (B, C, N, 2) what of the distance to the partner counts, M r: across the surface, or all of it.
+        jacobian: (B, C, N, 2, 3) its derivative, M J; M is a projection.
+        freedom: (B, C, N) directions in which a residual counts, the trace of M.
+        centre: (B, C, 2) centroid of the moved points. length: (B, C) L, at least the noise: points on one spot do not turn.
+    """
+
+    weights: Tensor
+    residual: Tensor
+    jacobian: Tensor
+    freedom: Tensor
+    centre: Tensor
+    length: Tensor
+
+    @classmethod
+    def of(cls, source: Tensor, support: Support, motions: Tensor, metric: str, scale: Tensor, noise: Tensor) -> Linearisation:
+        """Arguments as in `motion_covariance`."""
+        moved = se2.apply(motions, source[:, None])  # (B, C, N, 2)
+        residual = moved - support.partner[:, None]
+        weights, along = support.weights, torch.zeros_like(moved)
+        if metric != "point":
+            squared_scale = (scale**2).expand(len(source))[:, None, None]
+            weights = weights / (1 + (residual**2).sum(-1) / squared_scale)
+            along = moved_tangents(source, support, motions, noise)
+        total = weights.sum(-1).clamp(min=1e-9)  # (B, C)
+        centre = (weights[..., None] * moved).sum(-2) / total[..., None]
+        arm = moved - centre[..., None, :]
+        length = ((weights * (arm**2).sum(-1)).sum(-1) / total + noise[:, None] ** 2).sqrt()
+        lever = torch.stack([-arm[..., 1], arm[..., 0]], -1) / length[..., None, None]
+        shifts = torch.eye(2, dtype=moved.dtype, device=moved.device).expand(*moved.shape, 2)
+        every = torch.cat([lever[..., None], shifts, residual[..., None]], -1)  # (B, C, N, 2, 4)
+        across = every - along[..., None] * (along[..., None] * every).sum(-2, keepdim=True)
+        freedom = 2 - (along**2).sum(-1)
+        return cls(weights, across[..., 3], across[..., :3], freedom, centre, length)
+
+
+def moved_tangents(source: Tensor, support: Support, motions: Tensor, noise: Tensor) -> Tensor:
+    """(B, C, N, 2) direction of the surface under every motion; 0 for a lonely partner. Arguments as in `motion_covariance`."""
+    tangent, is_found = surface_tangents(source, support.weights.sum(1) > 0, noise)
+    turned = se2.rotate(motions[..., :1], tangent[:, None])
+    given = support.tangent[:, None]
+    return torch.where(is_found[:, None, :, None] & (given != 0).any(-1, keepdim=True), turned, given)
+
+
+def about_origin(local: Tensor, length: Tensor, offset: Tensor) -> Tensor:
+    """Covariance of (theta, tx, ty) from that of (theta L, x, y) about a centroid, where a turn moves t as well.
+
+    local: (..., 3, 3). length: (...,) L. offset: (..., 2) t minus the centroid.
+    """
+    one, zero = torch.ones_like(length), torch.zeros_like(length)
+    turn = torch.stack([one, -offset[..., 1], offset[..., 0]], -1) / length[..., None]  # d (theta, t) / d (theta L)
+    shifts = (torch.stack([zero, one, zero], -1), torch.stack([zero, zero, one], -1))
+    change = torch.stack([turn, *shifts], -1)
+    covariance = change @ local @ change.mT
+    return (covariance + covariance.mT) / 2
+
+
+def shared_scores(score: Tensor) -> Tensor:
+    """(B, C, 3, 3) mean over all ways to cut the points into runs of `RUN` of the sum of the runs' squared scores.
+
+    Padding and strangers to a cluster add nothing. score: (B, C, N, 3), in beam order.
+    """
+    flat = score.flatten(0, 1).mT  # (B C, 3, N)
+    padded = nn.functional.pad(flat, (RUN - 1, RUN - 1))
+    runs = RUN * nn.functional.avg_pool1d(padded, RUN, stride=1)  # (B C, 3, N + RUN - 1)
+    return (runs @ runs.mT / RUN).unflatten(0, score.shape[:2])
+
+
+def surface_tangents(points: Tensor, mask: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Direction of the surface at every point, from a stretch that is long beside the noise.
+
+    Args:
+        points: (B, N, 2) in beam order. mask: (B, N) points that count. noise: (B,) metres.
+
+    Returns:
+        (B, N, 2) unit vectors along the main axis of the neighbouring points, and (B, N) where there is such an axis.
+    """
+    padded = nn.functional.pad(points, (0, 0, NEIGHBOURS, NEIGHBOURS)).unfold(1, 2 * NEIGHBOURS + 1, 1)  # (B, N, 2, W)
+    real = nn.functional.pad(mask, (NEIGHBOURS, NEIGHBOURS)).unfold(1, 2 * NEIGHBOURS + 1, 1) & mask[..., None]
+    arm = padded.mT - points[..., None, :]  # (B, N, W, 2)
+    squared = (arm**2).sum(-1)
+    others = real & (torch.arange(2 * NEIGHBOURS + 1, device=points.device) != NEIGHBOURS)
+    is_found = others.any(-1)
+    nearest = squared.masked_fill(~others, torch.inf).amin(-1).masked_fill(~is_found, 0.0)
+    stretch = (STRETCH * noise[:, None]) ** 2 + STEPS**2 * nearest
+    kernel = (1 - squared / stretch[..., None]).clamp(min=0) * real
+    share = (kernel / kernel.sum(-1, keepdim=True).clamp(min=1e-9))[..., None]
+    spread = arm - (share * arm).sum(-2, keepdim=True)
+    xx, yy = (share * spread**2).sum(-2).unbind(-1)
+    xy = (share[..., 0] * spread[..., 0] * spread[..., 1]).sum(-1)
+    angle = safe_atan2(2 * xy, xx - yy) / 2
+    return torch.stack([angle.cos(), angle.sin()], -1), is_found & (xx + yy > 0)
+
+
+class Answers(Protocol):
+    """What confidences are read from: a `Prediction`, or a round's state."""
+
+    @property
+    def association(self) -> Tensor:
+        """(B, N)."""
+
+    @property
+    def cluster(self) -> Tensor:
+        """(B, N)."""
+
+    @property
+    def candidates(self) -> Tensor:
+        """(B, N, K)."""
+
+    @property
+    def log_association(self) -> Tensor:
+        """(B, N, K+1)."""
+
+    @property
+    def log_cluster(self) -> Tensor:
+        """(B, N, D)."""
+
+
+class Calibration(nn.Module):
+    """What was fitted so that confidences and covariances mean what they say (`learning.calibration_fit`).
+
+    A confidence is sigmoid(slope * log-odds + offset) of the chosen label against the others: labels stay as they are.
+
+    Attributes:
+        association, cluster: (2,) slope and offset.
+        covariance_factor: () of all motions' covariances.
+    """
+
+    association: Tensor
+    cluster: Tensor
+    covariance_factor: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("association", torch.tensor([1.0, 0.0]))
+        self.register_buffer("cluster", torch.tensor([1.0, 0.0]))
+        self.register_buffer("covariance_factor", torch.tensor(1.0))
+
+    def forward(self, prediction: Answers) -> tuple[Tensor, Tensor]:
+        """(B, N) confidences of associations, to be right within `WITHIN` target points, and of clusters, in [0, 1]."""
+        association = self.association.to(prediction.log_association)
+        cluster = self.cluster.to(prediction.log_cluster)
+        return (
+            torch.sigmoid(association[0] * association_log_odds(prediction) + association[1]),
+            torch.sigmoid(cluster[0] * cluster_log_odds(prediction) + cluster[1]),
+        )
+
+
+def association_log_odds(prediction: Answers) -> Tensor:
+    """(B, N) log-odds that the association is right within `WITHIN` target points."""
+    association = prediction.association[..., None]
+    near = ((prediction.candidates - association).abs() <= WITHIN) & (association >= 0)  # (B, N, K)
+    return log_odds(prediction.log_association, torch.cat([near, association < 0], -1))
+
+
+def cluster_log_odds(prediction: Answers) -> Tensor:
+    """(B, N) log-odds of the chosen cluster."""
+    states = prediction.log_cluster.shape[-1]
+    state = torch.where(prediction.cluster >= 0, prediction.cluster, states - 1)
+    return log_odds(prediction.log_cluster, nn.functional.one_hot(state, states).bool())
+
+
+def log_odds(log_beliefs: Tensor, chosen: Tensor) -> Tensor:
+    """Log-odds of the chosen states against the others, finite. log_beliefs, chosen: (..., S). Returns (...,)."""
+    log_beliefs = log_beliefs.clamp(min=MOST_CERTAIN)
+    yes = log_beliefs.masked_fill(~chosen, 2 * MOST_CERTAIN).logsumexp(-1)
+    return yes - log_beliefs.masked_fill(chosen, 2 * MOST_CERTAIN).logsumexp(-1)

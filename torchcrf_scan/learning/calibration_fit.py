@@ -1,0 +1,145 @@
+"""Fits what turns log-odds into confidences and residuals into covariances, on annotated pairs and a fitted model's answers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize
+from scipy.special import expit
+from scipy.stats import chi2
+
+from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.evaluation.calibration import MOTION_FREEDOM, background_nees, rightness
+from torchcrf_scan.inference.uncertainty import WITHIN, Calibration, association_log_odds, cluster_log_odds
+from torchcrf_scan.learning.material import Material
+from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.scan import Bools, Floats, ScanPair
+
+FEWEST_PAIRS = 10  # that a factor of the covariances is fitted on
+FIT_QUANTILE = 0.9  # at which the covariances' factor is fitted: up to a tenth of the pairs may have a wrong background
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Answers for annotated pairs beside the truth: P returns and Q pairs with a known background motion.
+
+    Attributes:
+        association_log_odds, cluster_log_odds: (P,).
+        association_right, association_exact, cluster_right: (P,) bool; right is within `WITHIN` target beams.
+        nees: (Q,) normalised errors of the background's motion.
+    """
+
+    association_log_odds: Floats
+    association_right: Bools
+    association_exact: Bools
+    cluster_log_odds: Floats
+    cluster_right: Bools
+    nees: Floats
+
+    @classmethod
+    def joined(cls, parts: Sequence[Judged]) -> Judged:
+        """All parts as one. Raises ValueError for none."""
+        if not parts:
+            raise ValueError("parts: expected at least one, got none")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
+
+
+@torch.no_grad()
+def calibrate(model: JointScanCRF, material: Sequence[Material]) -> None:
+    """Fits the calibration of a fitted model in place, on the pairs and from the starts that it was fitted on.
+
+    The scans are those from before they were disturbed: disturbance moves whole scans, and covariances that account for it would
+    be four to six times too large for others. What was fitted before does not matter. A model of one chain keeps the default.
+    """
+    model.calibration.load_state_dict(Calibration().state_dict())
+    if model.config.chains != "joint":
+        return
+    parts = []
+    for part in material:
+        batch = ScanPairBatch.collate(part.pairs).without_truth()
+        parts.append(judge(part.pairs, model(batch, part.start)))
+    model.calibration.load_state_dict(fit_calibration(Judged.joined(parts)).state_dict())
+
+
+@torch.no_grad()
+def judge(pairs: Sequence[ScanPair], prediction: Prediction) -> Judged:
+    """Compares the prediction of a batch with the annotation of its B pairs. Raises ValueError for a pair without one."""
+    association, cluster = association_log_odds(prediction), cluster_log_odds(prediction)
+    parts = []
+    for b, pair in enumerate(pairs):
+        answer = prediction.pair(b, pair)
+        right, nees = rightness(pair, answer, WITHIN), np.array([background_nees(pair, answer)])
+        known, n = right.known, len(pair.source)
+        parts.append(
+            Judged(
+                association_log_odds=association[b, :n].double().cpu().numpy()[known],
+                association_right=right.within[known],
+                association_exact=right.exact[known],
+                cluster_log_odds=cluster[b, :n].double().cpu().numpy()[known],
+                cluster_right=right.cluster[known],
+                nees=nees[np.isfinite(nees)],
+            )
+        )
+    return Judged.joined(parts)
+
+
+def fit_calibration(judged: Judged) -> Calibration:
+    """Both chains' slopes and offsets, and the factor of the covariances; what there are too few answers for stays as it is.
+
+    judged: with covariances as `motion_covariance` gives them, not yet multiplied.
+    """
+    calibration = Calibration()
+    if not len(judged.association_right):
+        return calibration
+    calibration.association.copy_(torch.from_numpy(fit_confidence(judged.association_log_odds, judged.association_right)))
+    calibration.cluster.copy_(torch.from_numpy(fit_confidence(judged.cluster_log_odds, judged.cluster_right)))
+    if len(judged.nees) >= FEWEST_PAIRS:
+        calibration.covariance_factor.fill_(fit_covariance_factor(judged.nees))
+    return calibration
+
+
+def fit_confidence(log_odds: ArrayLike, is_right: ArrayLike) -> Floats:
+    """(2,) slope >= 0 and offset of the confidence sigmoid(slope * log-odds + offset) by least negative log-likelihood (Platt).
+
+    With his targets (n + 1) / (n + 2) and 1 / (n + 2) in place of 1 and 0, so that it is finite for answers that are all right.
+
+    Args:
+        log_odds: (P,). is_right: (P,) bool.
+
+    Raises:
+        ValueError: no answers.
+    """
+    values, right = np.asarray(log_odds, dtype=np.float64), np.asarray(is_right, dtype=bool)
+    if not len(values) or values.shape != right.shape:
+        raise ValueError(f"log_odds: expected one or more (P,) and is_right as many, got {values.shape} and {right.shape}")
+    yes, no = int(right.sum()), int((~right).sum())
+    target = np.where(right, (yes + 1) / (yes + 2), 1 / (no + 2))
+
+    def loss(parameters: Floats) -> tuple[float, Floats]:
+        score = parameters[0] * values + parameters[1]
+        excess = (expit(score) - target) / len(values)
+        return float((np.logaddexp(0, score) - target * score).mean()), np.array([excess @ values, excess.sum()])
+
+    found = minimize(loss, np.array([0.5, 0.0]), jac=True, method="L-BFGS-B", bounds=[(0.0, None), (None, None)])
+    return np.asarray(found.x, dtype=np.float64)
+
+
+def fit_covariance_factor(nees: ArrayLike, quantile: float = FIT_QUANTILE, freedom: int = MOTION_FREEDOM) -> float:
+    """The factor on covariances that gives normalised errors a quantile of the chi-square: motions that are wrong do not count.
+
+    Args:
+        nees: (Q,) with the factor 1.
+        quantile: in (0, 1); 0.5 is the most robust, but errors have longer tails than the normal, and then promises too much.
+        freedom: degrees of the chi-square.
+
+    Raises:
+        ValueError: no errors.
+    """
+    values = np.asarray(nees, dtype=np.float64)
+    if not len(values):
+        raise ValueError("nees: expected at least one number, got none")
+    return float(np.quantile(values, quantile) / chi2.ppf(quantile, freedom))
