@@ -58,10 +58,14 @@ def position_features(
     return torch.stack([robust_square(radius, scales.local[9]), robust_square(translation, scales.local[10])], dim=-1)
 
 
+def registered_distance(moved: Tensor, target_points: Tensor, candidates: Tensor) -> Tensor:
+    """(B, N, K) metres to the candidates after the point's own motion. moved: (B, N, 2) source points under it."""
+    return torch.linalg.vector_norm(moved[:, :, None] - gather_points(target_points, candidates), dim=-1)
+
+
 def registered_feature(moved: Tensor, target_points: Tensor, candidates: Tensor, scales: Scales) -> Tensor:
     """L12: distance after the point's own motion. moved: (B, N, 2) source points under it. Returns (B, N, K)."""
-    q = gather_points(target_points, candidates)
-    return robust_square(torch.linalg.vector_norm(moved[:, :, None] - q, dim=-1), scales.local[11])
+    return robust_square(registered_distance(moved, target_points, candidates), scales.local[11])
 
 
 def outlier_inputs(local: Tensor, data_margin: Tensor, candidates: Tensor, candidate_mask: Tensor) -> Tensor:

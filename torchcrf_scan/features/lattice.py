@@ -1,7 +1,7 @@
 """Features of the lattice: association and clustering joined into super-nodes (j, k), spec 7.7.
 
 A super-node's states are pairs of an association state j (K candidates, the outlier last: A = K + 1) and a cluster k (C clusters,
-the outlier last: D = C + 1). The 30 named weights stay, but nothing is plugged in any more: every feature sees its own j and k.
+the outlier last: D = C + 1). The named weights stay, but nothing is plugged in any more: every feature sees its own j and k.
 Transitions (j, k) -> (j', k') are never spelled out as an A D x A D table. They are A(j, j') + C(k, k') and, for stiffness and
 elongation, a third term that needs both, but of k and k' only whether they are the same inlier cluster, two, or the outlier.
 """
@@ -15,17 +15,28 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchcrf_scan.features import association, clustering
+from torchcrf_scan.features.extension import association_extension, clustering_extension
+from torchcrf_scan.features.free_space import FreeSpace, look
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, state_mask, unary_at
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, STATIC_CHANNELS, Scales, robust_square
+from torchcrf_scan.features.scales import (
+    ASSOCIATION_UNARY,
+    ASSOCIATION_WEIGHTS,
+    CLUSTERING_UNARY,
+    STATIC_CHANNELS,
+    Scales,
+    robust_square,
+)
 from torchcrf_scan.features.shape import gather_points
+from torchcrf_scan.geometry import se2
 
-# Where the features' weights are among the 30, association before clustering.
+# Where the features' weights are among all, association before clustering.
 FIRST_CLUSTERING = len(ASSOCIATION_WEIGHTS)
+FIRST_EDGE = FIRST_CLUSTERING + CLUSTERING_UNARY
 STATIC_WEIGHTS = (*range(STATIC_CHANNELS), 13)
-MOVING_WEIGHTS = (11, 12, *range(FIRST_CLUSTERING, FIRST_CLUSTERING + 4))
-ASSOCIATION_PAIRWISE = slice(14, FIRST_CLUSTERING)
-CLUSTER_PAIRWISE = slice(FIRST_CLUSTERING + 4, None)
-ELASTIC_WEIGHTS = slice(FIRST_CLUSTERING + 7, FIRST_CLUSTERING + 10)  # Q4..Q6, also among CLUSTER_PAIRWISE
+MOVING_WEIGHTS = (11, 12, *range(14, ASSOCIATION_UNARY), *range(FIRST_CLUSTERING, FIRST_EDGE))
+ASSOCIATION_PAIRWISE = slice(ASSOCIATION_UNARY, FIRST_CLUSTERING)
+CLUSTER_PAIRWISE = slice(FIRST_EDGE, None)
+ELASTIC_WEIGHTS = slice(FIRST_EDGE + 3, FIRST_EDGE + 6)  # Q4..Q6, also among CLUSTER_PAIRWISE
 
 SAME, DIFFERENT, TOUCHING = range(3)  # kinds of cluster transitions: one inlier cluster, two, the outlier at an end
 ELASTIC_KINDS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))  # Q4..Q6 by kind
@@ -70,7 +81,8 @@ class LatticeFeatures:
 
     Attributes:
         static: (B, N, A, 12) what depends on j alone: L1..L11 and the outlier booster's margin.
-        moving: (B, N, A, D, 6) registered translation, the data booster's margin, C1..C4.
+        moving: (B, N, A, D, 19) registered translation, the data booster's margin, the association's extension, C1..C4, the
+            clustering's extension.
         pairwise_association: (B, N-1, A, A, 4) P1..P4.
         elastic: (B, N-1, A, A, 3) Q4..Q6 of two candidates, for the kinds of cluster transitions that they belong to.
         pairwise_cluster: (B, N-1, D, D, 8) Q1..Q8, without Q4..Q6.
@@ -85,7 +97,7 @@ class LatticeFeatures:
     mask: Tensor
 
     def potentials(self, weights: Tensor) -> LatticePotentials:
-        """Log potentials. weights: (30,), association before clustering."""
+        """Log potentials. weights: (43,), association before clustering."""
         log_unary = (self.static @ weights[list(STATIC_WEIGHTS)])[..., None] + self.moving @ weights[list(MOVING_WEIGHTS)]
         by_kind = weights[ELASTIC_WEIGHTS, None] * weights.new_tensor(ELASTIC_KINDS)  # (3 features, 3 kinds)
         log_association = (self.pairwise_association @ weights[ASSOCIATION_PAIRWISE])[..., None] + self.elastic @ by_kind
@@ -121,13 +133,16 @@ def lattice_features(
     best = registered.masked_fill(~possible[:, :, None, :-1], -torch.inf).amax(-1)  # (B, N, K)
     static = unary_at(states, best, scales, boosters)[..., list(STATIC_WEIGHTS)]
     registered = torch.cat([registered, best[..., None]], dim=-1)  # (B, N, K, D)
+    of_association, of_cluster = extension_channels(view, states, at, distance, motions, possible, scales)
     residual = at.residual.masked_fill(~possible[..., :-1], torch.inf).amin(-1)
     return LatticeFeatures(
         static=static,
         moving=torch.cat(
             [
                 registered_channels(registered, states.static_margin, scales, boosters),
+                of_association,
                 cluster_channels(robust_square(distance, scales.cluster_distance), residual > scales.outlier_threshold),
+                of_cluster,
             ],
             dim=-1,
         ),
@@ -157,6 +172,41 @@ def cluster_channels(distance: Tensor, unexplained: Tensor) -> Tensor:
     outlier_cluster = pad(unexplained.to(distance)[:, :, None, None].expand(B, N, K + 1, 1), (C, 0))
     both_outliers = pad(distance.new_ones(B, N, 1, 1), (C, 0, K, 0))
     return torch.stack([pad(distance, (0, 1, 0, 1)), outlier_cluster, both_inliers, both_outliers], dim=-1)
+
+
+def extension_channels(
+    view: PairView,
+    states: AssociationStates,
+    at: clustering.Correspondence,
+    distance: Tensor,
+    motions: Tensor,
+    possible: Tensor,
+    scales: Scales,
+) -> tuple[Tensor, Tensor]:
+    """Both chains' extensions of every super-node, (B, N, A, D, 5) and (B, N, A, D, 8).
+
+    A point in the outlier cluster is looked at where its background's motion takes it. An outlier of the association meets the
+    nearest target point. at: the points without associations; distance: (B, N, K, C).
+    """
+    K, C = distance.shape[2:]
+    ahead = look(view.target_sweep, at.moved)
+    best = distance.masked_fill(~possible[:, :, None, :-1], torch.inf).amin(-1, keepdim=True)
+    chains = []
+    for c in range(C + 1):
+        sight = FreeSpace(ahead.seen_through[..., c % C], ahead.hidden[..., c % C])
+        of_cluster = torch.cat([distance, best], dim=-1)[..., c]
+        chains.append(association_extension(of_cluster, states.mask, sight, scales))
+    partner = gather_points(view.batch.target, states.candidates)  # (B, N, K, 2)
+    carried_back = se2.apply(se2.inverse(motions), partner.flatten(1, 2)[:, None]).transpose(1, 2)  # (B, NK, C, 2)
+    back = look(view.source_sweep, carried_back)
+    clusters = []
+    for j in range(K + 1):
+        row = slice(j % K, None, K)  # candidate j of every point
+        seen = FreeSpace(back.seen_through[:, row], back.hidden[:, row])
+        is_inlier = torch.full_like(at.is_inlier, j < K)
+        residual = distance[:, :, j] if j < K else at.residual
+        clusters.append(clustering_extension(residual, ahead, seen, is_inlier, scales))
+    return torch.stack(chains, dim=3), torch.stack(clusters, dim=2)
 
 
 def elastic_features(source_points: Tensor, partner: Tensor, scales: Scales) -> Tensor:

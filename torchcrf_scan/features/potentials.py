@@ -9,10 +9,19 @@ from torch import Tensor, nn
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import InferenceConfig
-from torchcrf_scan.features import association, candidates
+from torchcrf_scan.features import association, candidates, clustering
 from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.features.candidates import Candidates
-from torchcrf_scan.features.scales import LOCAL_CHANNELS, STATIC_CHANNELS, Scales
+from torchcrf_scan.features.extension import association_extension, clustering_extension
+from torchcrf_scan.features.free_space import Sweep, look
+from torchcrf_scan.features.scales import (
+    ASSOCIATION_UNARY,
+    CLUSTERING_UNARY,
+    LOCAL_CHANNELS,
+    STATIC_CHANNELS,
+    Scales,
+    robust_square,
+)
 from torchcrf_scan.features.shape import ShapeDescriptors, describe, local_spacing
 from torchcrf_scan.geometry import se2
 
@@ -36,12 +45,15 @@ class PairView:
     Attributes:
         batch: the pairs in the unit of length that features are measured in.
         factor: (B,) that unit's factor on metres.
+        source_sweep, target_sweep: the scans as the sensor saw them.
     """
 
     batch: ScanPairBatch
     source_shape: ShapeDescriptors
     target_shape: ShapeDescriptors
     factor: Tensor
+    source_sweep: Sweep
+    target_sweep: Sweep
 
     @classmethod
     def of(cls, batch: ScanPairBatch, wrap_closed: bool = True, length_unit: str = "metre") -> PairView:
@@ -54,8 +66,15 @@ class PairView:
         factor = torch.ones_like(batch.dt) if length_unit == "metre" else REFERENCE_UNIT / resolution(batch)
         batch = batch.scaled(factor)
         source_closed, target_closed = batch.source_closed & wrap_closed, batch.target_closed & wrap_closed
-        source_shape = describe(batch.source, batch.source_mask, source_closed)
-        return cls(batch, source_shape, describe(batch.target, batch.target_mask, target_closed), factor)
+        here = torch.zeros_like(batch.target_origin)
+        return cls(
+            batch,
+            describe(batch.source, batch.source_mask, source_closed),
+            describe(batch.target, batch.target_mask, target_closed),
+            factor,
+            Sweep.of(batch.source, batch.source_mask, source_closed, batch.range_noise, here),
+            Sweep.of(batch.target, batch.target_mask, target_closed, batch.range_noise, batch.target_origin),
+        )
 
 
 @torch.no_grad()
@@ -105,19 +124,19 @@ def registered_points(source_points: Tensor, motions: Tensor, active: Tensor, lo
     return se2.apply(motion, source_points[:, :, None])[:, :, 0]
 
 
-def association_unary(
-    states: AssociationStates, moved: Tensor, target_points: Tensor, scales: Scales, boosters: Boosters
-) -> Tensor:
-    """The 14 local features of every state: 12 channels, data boosting, outlier boosting; the outlier state last (spec 2.4, 5.1).
+def association_unary(view: PairView, states: AssociationStates, moved: Tensor, scales: Scales, boosters: Boosters) -> Tensor:
+    """Features of every state, the outlier last: 12 channels, data and outlier boosting (spec 2.4, 5.1), the extensions.
 
-    moved: (B, N, 2) source points under their own motion. Returns (B, N, K+1, 14).
+    moved: (B, N, 2) source points under their own motion. Returns (B, N, K+1, 19).
     """
-    registered = association.registered_feature(moved, target_points, states.candidates, scales)
-    return unary_at(states, registered, scales, boosters)
+    distance = association.registered_distance(moved, view.batch.target, states.candidates)
+    registered = robust_square(distance, scales.local[STATIC_CHANNELS])
+    extension = association_extension(distance, states.mask, look(view.target_sweep, moved), scales)
+    return torch.cat([unary_at(states, registered, scales, boosters), extension], dim=-1)
 
 
 def unary_at(states: AssociationStates, registered: Tensor, scales: Scales, boosters: Boosters) -> Tensor:
-    """`association_unary` from the registered channel (B, N, K) of the candidates."""
+    """The paper's 14 of `association_unary` from the registered channel (B, N, K) of the candidates."""
     registered = registered[..., None]
     local = torch.cat([states.static, registered], dim=-1)  # (B, N, K, 12)
     margin = states.static_margin + boosters.data.margins(registered, first=STATIC_CHANNELS)
@@ -139,10 +158,21 @@ def association_potentials(unary: Tensor, pairwise: Tensor, mask: Tensor, weight
     """Log potentials (B, N, K+1) and (B, N-1, K+1, K+1) of the association chain.
 
     Args:
-        unary: (B, N, K+1, 14). pairwise: (B, N-1, K+1, K+1, 4). mask: (B, N, K) real candidates. weights: (18,).
+        unary: (B, N, K+1, 19). pairwise: (B, N-1, K+1, K+1, 4). mask: (B, N, K) real candidates. weights: (23,).
     """
-    log_unary = (unary @ weights[:14]).masked_fill(~state_mask(mask), -torch.inf)
-    return log_unary, pairwise @ weights[14:]
+    log_unary = (unary @ weights[:ASSOCIATION_UNARY]).masked_fill(~state_mask(mask), -torch.inf)
+    return log_unary, pairwise @ weights[ASSOCIATION_UNARY:]
+
+
+def clustering_unary(view: PairView, at: clustering.Correspondence, motions: Tensor, active: Tensor, scales: Scales) -> Tensor:
+    """Features of every cluster, the outlier last: C1..C4 (spec 4.1) and the extensions.
+
+    at: the source points under the motions (B, C, 3), of which `active` (B, C) exist. Returns (B, N, D, 12).
+    """
+    carried_back = se2.apply(se2.inverse(motions), at.partner[:, None]).transpose(1, 2)  # (B, N, C, 2)
+    sight = look(view.target_sweep, at.moved), look(view.source_sweep, carried_back)
+    extension = clustering_extension(at.residual, *sight, at.is_inlier, scales)
+    return torch.cat([clustering.local_features(at, active, scales), extension], dim=-1)
 
 
 def possible_clusters(active: Tensor, reach: Tensor | None, points: int) -> Tensor:
@@ -160,10 +190,10 @@ def clustering_potentials(local: Tensor, pairwise: Tensor, possible: Tensor, wei
     """Log potentials (B, N, D) and (B, N-1, D, D) of the clustering chain (spec 7.5: inactive clusters are impossible).
 
     Args:
-        local: (B, N, D, 4). pairwise: (B, N-1, D, D, 8). possible: (B, N, D) bool. weights: (12,).
+        local: (B, N, D, 12). pairwise: (B, N-1, D, D, 8). possible: (B, N, D) bool. weights: (20,).
     """
-    log_unary = (local @ weights[:4]).masked_fill(~possible, -torch.inf)
-    return log_unary, pairwise @ weights[4:]
+    log_unary = (local @ weights[:CLUSTERING_UNARY]).masked_fill(~possible, -torch.inf)
+    return log_unary, pairwise @ weights[CLUSTERING_UNARY:]
 
 
 def find_candidates(view: PairView, motions: Tensor, active: Tensor, config: InferenceConfig) -> Candidates:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 if TYPE_CHECKING:
     from torchcrf_scan.config import FeatureConfig
 
+GATE_WIDTH = 0.05
 KAPPA = 9.0  # an error of three standard deviations is as bad as any (spec 0.1)
 
 LOCAL_CHANNELS = (
@@ -18,13 +19,21 @@ LOCAL_CHANNELS = (
 )  # L1..L12
 SHAPE_CHANNELS = 9  # the first nine do not change when either scan moves
 STATIC_CHANNELS = 11  # the last one depends on the motions
+ASSOCIATION_DECISIONS = ("excess", "gate", "outlier_bias")  # extensions: the nearest point or another, and how far is too far
+CLUSTERING_DECISIONS = ("gate", "outlier_bias")
+ASSOCIATION_FREE_SPACE = ("outlier_seen_through", "outlier_hidden")
+CLUSTERING_FREE_SPACE = ("seen_through", "seen_through_back", "hidden", "hidden_back", "outlier_seen_through", "outlier_hidden")
 ASSOCIATION_WEIGHTS = (
     *LOCAL_CHANNELS,
     *("data_boosting", "outlier_boosting"),
+    *ASSOCIATION_DECISIONS,
+    *ASSOCIATION_FREE_SPACE,
     *("sequence", "pairwise_outlier", "pairwise_distance", "pairwise_translation"),
-)  # a01..a18
+)  # a01..a14, the extensions, a15..a18
 CLUSTERING_WEIGHTS = (
     *("cluster_distance", "outlier", "cluster_inlier_in", "cluster_inlier_out"),
+    *CLUSTERING_DECISIONS,
+    *CLUSTERING_FREE_SPACE,
     *(
         "sequence",
         "neighbour_weight_same",
@@ -33,21 +42,42 @@ CLUSTERING_WEIGHTS = (
         "neighbour_stiffness_different",
     ),
     *("neighbour_distance_same", "neighbour_distance_different", "pairwise_outlier"),
-)  # c01..c12
+)  # c01..c04, the extensions, c05..c12
+ASSOCIATION_UNARY, CLUSTERING_UNARY = len(ASSOCIATION_WEIGHTS) - 4, len(CLUSTERING_WEIGHTS) - 8  # a node's; the rest are an edge's
+FREE_SPACE_WEIGHTS = (
+    *(f"association.{name}" for name in ASSOCIATION_FREE_SPACE),
+    *(f"clustering.{name}" for name in CLUSTERING_FREE_SPACE),
+)
+DECISION_WEIGHTS = (
+    *(f"association.{name}" for name in ASSOCIATION_DECISIONS),
+    *(f"clustering.{name}" for name in CLUSTERING_DECISIONS),
+)
 
 
 def live_weights(config: FeatureConfig) -> tuple[Tensor, Tensor]:
-    """(18,) and (12,): 1 for the weights that the model has, 0 for those that stay 0 (raw channels in W-B, what is left out)."""
-    association = [name not in LOCAL_CHANNELS or config.raw_channels for name in ASSOCIATION_WEIGHTS]
-    for k, name in enumerate(ASSOCIATION_WEIGHTS):
-        association[k] &= f"association.{name}" not in config.left_out
-    clustering = [f"clustering.{name}" not in config.left_out for name in CLUSTERING_WEIGHTS]
+    """(23,) and (20,): 1 for the weights that the model has, 0 for those that stay 0 (raw channels in W-B, what is left out)."""
+    dead = {*config.left_out}
+    dead |= set() if config.raw_channels else {f"association.{name}" for name in LOCAL_CHANNELS}
+    dead |= set() if config.free_space else {*FREE_SPACE_WEIGHTS}
+    dead |= set() if config.decisions else {*DECISION_WEIGHTS}
+    association = [f"association.{name}" not in dead for name in ASSOCIATION_WEIGHTS]
+    clustering = [f"clustering.{name}" not in dead for name in CLUSTERING_WEIGHTS]
     return torch.tensor(association, dtype=torch.float64), torch.tensor(clustering, dtype=torch.float64)
+
+
+def has_weight(config: FeatureConfig, name: str) -> bool:
+    """Whether a model has the parameter `association.NAME` or `clustering.NAME`: the paper's 30 always, extensions where on."""
+    return (config.free_space or name not in FREE_SPACE_WEIGHTS) and (config.decisions or name not in DECISION_WEIGHTS)
 
 
 def robust_square(error: Tensor, scale: Tensor) -> Tensor:
     """Minus min((error / scale)^2, kappa): 0 is perfect, -9 as bad as it gets (spec 0.1, A-03)."""
     return -((error / scale) ** 2).clamp(max=KAPPA)
+
+
+def beyond_gate(distance: Tensor, scales: Scales) -> Tensor:
+    """0 well inside the gate of outliers, 1 well beyond it, a half at it; it takes about a fifth of the gate to turn."""
+    return torch.sigmoid((distance / scales.gate - 1) / GATE_WIDTH)
 
 
 class Scales(nn.Module):
@@ -60,6 +90,7 @@ class Scales(nn.Module):
         pairwise_outlier: (2,) their value on every transition that touches the outlier (A-14).
         cluster_distance: () scale of a point's residual under its own motion.
         outlier_threshold: () residual above which no motion explains a point.
+        gate: () residual that parts true pairs from outliers with the fewest errors.
         neighbour_weight: () reach of the neighbour weight.
         neighbour_distance: () scale of the elongation of an edge (stiffness, neighbour distance).
     """
@@ -70,6 +101,7 @@ class Scales(nn.Module):
     pairwise_outlier: Tensor
     cluster_distance: Tensor
     outlier_threshold: Tensor
+    gate: Tensor
     neighbour_weight: Tensor
     neighbour_distance: Tensor
 
@@ -83,6 +115,7 @@ class Scales(nn.Module):
             "pairwise_outlier": [-4.0, -4.0],
             "cluster_distance": 0.1,
             "outlier_threshold": 0.3,
+            "gate": 0.3,
             "neighbour_weight": 0.5,
             "neighbour_distance": 0.1,
         }

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.features import association
+from torchcrf_scan.features.candidates import squared_distances
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, association_unary
 from torchcrf_scan.features.scales import LOCAL_CHANNELS, Scales
 from torchcrf_scan.features.shape import gather_points
@@ -42,10 +43,18 @@ def fit_scales(views: Sequence[PairView], plugins: Sequence[PlugIns]) -> Scales:
     scales.pairwise[1] = robust_scale(errors["pairwise_translation"], FLOOR)
     scales.cluster_distance.copy_(robust_scale(errors["cluster"], CLUSTER_FLOOR))
     scales.outlier_threshold.copy_((3 * scales.cluster_distance).clamp(min=0.3))
+    scales.gate.copy_(fit_gate(errors["cluster"], errors["unmatched"]))
     scales.neighbour_weight.copy_(2 * errors["step"].median() if len(errors["step"]) else scales.neighbour_weight)
     scales.neighbour_distance.copy_(robust_scale(errors["elongation"], CLUSTER_FLOOR))
     fit_outlier_constants(views, plugins, scales)
     return scales
+
+
+def fit_gate(matched: Tensor, unmatched: Tensor) -> Tensor:
+    """() the distance that parts true pairs (P,) from outliers (Q,), their nearest point's distance, with the fewest errors."""
+    gates = torch.cat([matched, unmatched, matched.new_zeros(1)]).clamp(min=CLUSTER_FLOOR).unique()  # ascending
+    right, wrong = (torch.searchsorted(of.sort().values, gates, right=True) for of in (matched, unmatched))  # let through
+    return gates[(right - wrong).argmax()]
 
 
 def true_errors(view: PairView, plugins: PlugIns) -> dict[str, Tensor]:
@@ -75,6 +84,9 @@ def true_errors(view: PairView, plugins: PlugIns) -> dict[str, Tensor]:
     initial = se2.apply(batch.initial_motion, batch.source)
     out["translation"] = torch.linalg.vector_norm(initial - partner, dim=-1)[inlier].double()
     residual = torch.linalg.vector_norm(moved_by_own - partner, dim=-1)[inlier].double()
+    unmatched = batch.truth.known & batch.source_mask & (batch.truth.association < 0)
+    nearest = squared_distances(moved_by_own, batch.target, batch.target_mask).amin(-1).sqrt()
+    out["unmatched"] = nearest[unmatched].double()
     out["registered_translation"] = out["cluster"] = residual
     return out | edge_errors(batch.source, partner, inlier, plugins.label)
 
@@ -109,7 +121,7 @@ def fit_outlier_constants(views: Sequence[PairView], plugins: Sequence[PlugIns],
         inlier = batch.truth.known & plug.known & (batch.truth.association >= 0) & (plug.label >= 0)
         index = batch.truth.association.clamp(min=0)[..., None]
         states = AssociationStates.of(view, index, torch.ones_like(index, dtype=torch.bool), scales, boosters)
-        unary = association_unary(states, own_motion(plug, batch.source), batch.target, scales, boosters)
+        unary = association_unary(view, states, own_motion(plug, batch.source), scales, boosters)
         local.append(unary[:, :, 0, : len(LOCAL_CHANNELS)][inlier])
         pairwise = association.pairwise_features(batch.source, batch.target, index, scales)[:, :, 0, 0, 2:]
         edges.append(pairwise[inlier[:, 1:] & inlier[:, :-1]])

@@ -1,0 +1,59 @@
+"""Features beside the paper's thirty (`features.decisions`, `features.free_space`): what parts inliers from outliers.
+
+Robust squares say little of how far is too far, so there is a gate and a constant; nor do they insist on the nearest of several
+points. And a point that beams of the other scan go through under a motion does not move so (design finding 13). Names and order
+are those of `scales.py`.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchcrf_scan.features.free_space import FreeSpace
+from torchcrf_scan.features.scales import Scales, beyond_gate
+
+FARTHEST_EXCESS = 3.0  # scales
+
+
+def association_extension(distance: Tensor, mask: Tensor, sight: FreeSpace, scales: Scales) -> Tensor:
+    """The association chain's extension of every state, the outlier last.
+
+    Args:
+        distance: (B, N, K) to the candidates under the point's own motion; mask: (B, N, K) which are real.
+        sight: what the target's beams say of the points under their own motion, (B, N).
+
+    Returns:
+        (B, N, K+1, 5).
+    """
+    nearest = distance.masked_fill(~mask, torch.inf).amin(-1, keepdim=True)
+    excess = ((distance - nearest) / scales.cluster_distance).clamp(0, FARTHEST_EXCESS)
+    inliers = torch.stack([-excess, -beyond_gate(distance, scales)], dim=-1)
+    outlier = torch.stack([torch.ones_like(sight.hidden), sight.seen_through, sight.hidden], dim=-1)
+    return with_outlier(inliers, outlier)
+
+
+def clustering_extension(residual: Tensor, ahead: FreeSpace, back: FreeSpace, is_inlier: Tensor, scales: Scales) -> Tensor:
+    """The clustering chain's extension of every state, the outlier last.
+
+    Args:
+        residual: (B, N, C) under every motion.
+        ahead: what the target's beams say of the points under every motion, (B, N, C).
+        back: what the source's beams say of the points' partners under every motion's inverse, (B, N, C); counts for inliers.
+        is_inlier: (B, N) whether the point has a partner.
+
+    Returns:
+        (B, N, D, 8).
+    """
+    partnered = is_inlier[..., None].to(residual)
+    contradicted = [ahead.seen_through, back.seen_through * partnered, ahead.hidden, back.hidden * partnered]
+    inliers = -torch.stack([beyond_gate(residual, scales), *contradicted], dim=-1)
+    under_background = [ahead.seen_through[..., 0], ahead.hidden[..., 0]]
+    outlier = torch.stack([torch.ones_like(under_background[0]), *under_background], dim=-1)
+    return with_outlier(inliers, outlier)[..., [0, 5, 1, 2, 3, 4, 6, 7]]
+
+
+def with_outlier(inliers: Tensor, outlier: Tensor) -> Tensor:
+    """Joins features of inlier states (B, N, S, F) and of the outlier (B, N, G), neither having the other's: (B, N, S+1, F+G)."""
+    return torch.cat([pad(inliers, (0, outlier.shape[-1])), pad(outlier, (inliers.shape[-1], 0))[:, :, None]], dim=2)
