@@ -23,11 +23,13 @@ from torchcrf_scan.features.potentials import (
     association_potentials,
     association_unary,
     clustering_potentials,
+    clustering_unary,
     find_candidates,
     possible_clusters,
     registered_points,
     state_mask,
 )
+from torchcrf_scan.features.scales import ASSOCIATION_UNARY
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.inference import joint
 from torchcrf_scan.inference.initialise import Start
@@ -68,7 +70,7 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
         if stop_early and bool(converged.all()):
             break
     merged = joint.merge_alike(view, run.state, parameters.scales.cluster_distance)
-    return joint.read_out(merged, converged, iterations)
+    return joint.read_out(view, start, merged, parameters, model.inference, converged, iterations)
 
 
 class Flooding:
@@ -122,7 +124,7 @@ class Flooding:
         at = clustering.correspond(
             batch.source[:, around], batch.target, state.motions.value, found.nearest[:, around], state.association[:, around]
         )
-        local = clustering.local_features(at, state.motions.active, scales)
+        local = clustering_unary(self.view, at, state.motions.value, state.motions.active, scales)
         pairwise = clustering.pairwise_features(batch.source[:, around], at, scales)
         possible = possible_clusters(state.motions.active, self.start.reach, batch.source.shape[1])[:, around]
         unary, edges = clustering_potentials(local, pairwise, possible, self.parameters.clustering)
@@ -143,7 +145,8 @@ class Flooding:
         motions, active = state.motions.value, state.motions.active
         moved = registered_points(batch.source[:, here], motions, active, state.log_cluster[:, here])
         states = self.states.nodes(here)
-        unary = association_unary(states, moved, batch.target, scales, boosters) @ self.parameters.association[:14]
+        features = association_unary(self.view, states, moved, scales, boosters)
+        unary = features @ self.parameters.association[:ASSOCIATION_UNARY]
         unary = unary.masked_fill(~state_mask(states.mask), -torch.inf)[:, 0]
         before = self.edges[:, i - 1] if i > 0 else None
         after = self.edges[:, i] if i < self.edges.shape[1] else None
@@ -207,7 +210,7 @@ class Flooding:
             setattr(self.association_messages, name, torch.cat([carried, message[..., -1:]], dim=-1))
         self.states = AssociationStates.of(self.view, found.index, found.mask, scales, self.parameters.boosters)
         pairwise = pairwise_features(batch.source, batch.target, found.index, scales)
-        none = pairwise.new_zeros(*found.index.shape, 14)
+        none = pairwise.new_zeros(*found.index.shape, ASSOCIATION_UNARY)
         _, self.edges = association_potentials(
             torch.cat([none, none[:, :, :1]], dim=2), pairwise, found.mask, self.parameters.association
         )

@@ -2,7 +2,8 @@
 
 `survey` looks at the scans: the background by shape-only matching with RANSAC and registrations from a grid of starts, the best by
 what it leaves unexplained over the whole scene (`background.py`), and the hypothesised motions of what it does not explain
-(`hypotheses.py`). `choose` accepts movers among them by the learned score (`movers.py`). No gradient passes through the start.
+(`hypotheses.py`). `choose` keeps those that the learned score does not rule out (`movers.py`). No gradient passes through
+the start.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from torchcrf_scan.inference.background import background_pool, unit_length
 from torchcrf_scan.inference.cold import ransac_motions, shape_association
 from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
 from torchcrf_scan.inference.hypothesis_features import hypothesis_features
-from torchcrf_scan.inference.movers import HypothesisScore, find_movers
+from torchcrf_scan.inference.movers import HypothesisScore, select
 from torchcrf_scan.inference.surface import Surface
 
+CONSIDERED = 0.1  # probability from which a mover is considered; the score alone accepts from its own threshold
 FEWEST_POINTS = 3  # a scan with fewer says nothing of the motion
 RANSAC_STARTS = 4
 REACH_EXTENT = 0.5  # of an object's seen extent, and
@@ -40,6 +42,8 @@ class Start:
         association: (B, N) nearest target point under the best motion, -1 where none comes near.
         target_tangents: (B, M, 2) direction of the target's surface at every point, 0 where it has none.
         reach: (B, N, C) bool, points near enough to the segment that a mover was found by: an object is in one place. None: any.
+        log_odds: (B, C) what the score says of every mover, those that it alone would not accept (and that are not `active`)
+            included; -inf where there is none, inf for the background. None: `active` has been decided.
     """
 
     motions: Tensor
@@ -47,10 +51,15 @@ class Start:
     association: Tensor
     target_tangents: Tensor
     reach: Tensor | None = None
+    log_odds: Tensor | None = None
+
+    def considered(self) -> Start:
+        """The same with all movers that the score does not rule out, for the model to decide about."""
+        return self if self.log_odds is None else replace(self, active=self.log_odds > -torch.inf)
 
     def background_alone(self) -> Start:
         """The start of CRF-Matching, which has one motion."""
-        return replace(self, motions=self.motions[:, :1], active=self.active[:, :1], reach=None)
+        return replace(self, motions=self.motions[:, :1], active=self.active[:, :1], reach=None, log_odds=None)
 
     def scaled(self, factor: Tensor) -> Start:
         """The same start in another unit of length, a factor (B,) a pair."""
@@ -90,7 +99,7 @@ def survey(batch: ScanPairBatch) -> list[Survey | None]:
             found.append(None)
             continue
         source = Surface.of(batch.source[b, :n], batch.range_noise[b], bool(batch.source_closed[b]))
-        target = Surface.of(batch.target[b, :m], batch.range_noise[b], bool(batch.target_closed[b]))
+        target = Surface.of(batch.target[b, :m], batch.range_noise[b], bool(batch.target_closed[b]), batch.target_origin[b])
         background = find_background(source, target, batch.initial_motion[b], shape_matches[b, :n])
         hypotheses = hypothesise(source, target, background, float(batch.dt[b]))
         features = hypothesis_features(hypotheses, source, target, background)
@@ -104,18 +113,21 @@ def choose(batch: ScanPairBatch, surveys: Sequence[Survey | None], score: Hypoth
     motions = batch.initial_motion[:, None].repeat(1, clusters, 1)
     active = torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
     active[:, 0] = True
+    log_odds = torch.where(active, torch.inf, -torch.inf).to(motions)
     members = torch.zeros(len(batch), clusters, batch.source.shape[1], dtype=torch.bool, device=motions.device)
     tangents = torch.zeros_like(batch.target)
     for b, seen in enumerate(surveys):
         if seen is None:
             continue
-        found = find_movers(seen.hypotheses, seen.features, seen.source, seen.target, score, most=clusters - 1)
+        found = select(seen.hypotheses, score(seen.features), seen.source, seen.target, threshold=CONSIDERED, most=clusters - 1)
         slots = slice(1, 1 + len(found.motions))
-        motions[b, 0], motions[b, slots], active[b, slots] = seen.background, found.motions, True
+        motions[b, 0], motions[b, slots] = seen.background, found.motions
+        active[b, slots] = found.probabilities >= score.threshold
+        log_odds[b, slots] = found.probabilities.logit(1e-6)
         members[b, slots, : len(seen.source)] = found.members
         tangents[b, : len(seen.target)] = seen.target.tangent
     reach = within_reach(batch.source, members, resolution(batch))
-    return Start(motions, active, nearest_association(batch, motions, active, reach), tangents, reach)
+    return Start(motions, active, nearest_association(batch, motions, active, reach), tangents, reach, log_odds)
 
 
 def find_background(source: Surface, target: Surface, guess: Tensor, match: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ A pair that has settled is frozen, so that it does not matter which other pairs 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ from torchcrf_scan.features.potentials import (
     association_potentials,
     association_unary,
     clustering_potentials,
+    clustering_unary,
     find_candidates,
     possible_clusters,
     registered_points,
@@ -35,19 +36,24 @@ from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.lattice import lattice_beliefs
 from torchcrf_scan.inference.messages import chain_beliefs
 from torchcrf_scan.inference.motion import Motions, estimate, hard_support, retire_empty, soft_support, trim
+from torchcrf_scan.inference.selection import ClusterPotential, discard_vacuous
+from torchcrf_scan.inference.uncertainty import Calibration, motion_covariance
 
 MERGE_ROTATION = 0.01  # radians
+SELECTION_ROUNDS = 2  # that begin with the question which movers there are
 ROBUST_SHARE = 0.3  # of a point's usual residual: across a surface errors are smaller than from point to point
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What was learned: weights (18,) and (12,), the features' scales and boosters."""
+    """What was learned: weights (23,) and (20,), the features' scales and boosters, honest confidences, a mover's worth."""
 
     association: Tensor
     clustering: Tensor
     scales: Scales
     boosters: Boosters
+    calibration: Calibration = field(default_factory=Calibration)
+    potential: ClusterPotential = field(default_factory=ClusterPotential)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +79,15 @@ class State:
 def decode(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> Prediction:
     """Labels and motions of a batch by the sweep schedule; differentiable through beliefs and, where soft, through motions."""
     batch, config = view.batch, model.inference
+    is_chosen = config.movers == "threshold" or start.log_odds is None or model.chains == "matching"
+    start = start if is_chosen else start.considered()
     state = first_state(view, start, parameters, config)
     before = older = state
     converged = torch.zeros(len(batch), dtype=torch.bool, device=batch.source.device)
     iterations = torch.zeros(len(batch), dtype=torch.int64, device=batch.source.device)
-    for _ in range(config.iterations):
+    for done in range(config.iterations):
+        if done < SELECTION_ROUNDS and not is_chosen:
+            state = discard_vacuous(view, start, state, parameters, config)
         after = step(view, start, state, parameters, config, model.chains, model.coupling)
         if config.stop_early:
             after = damp(after, state, older)
@@ -87,7 +97,8 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
         converged = converged | has_settled(state, before, config)
         if config.stop_early and bool(converged.all()):
             break
-    return read_out(merge_alike(view, state, parameters.scales.cluster_distance), converged, iterations)
+    merged = merge_alike(view, state, parameters.scales.cluster_distance)
+    return read_out(view, start, merged, parameters, config, converged, iterations)
 
 
 def first_state(view: PairView, start: Start, parameters: Parameters, config: InferenceConfig) -> State:
@@ -164,7 +175,7 @@ def update_clusters(
     """An exact pass over the clustering chain, motions and associations plugged in."""
     batch, scales = view.batch, parameters.scales
     at = clustering.correspond(batch.source, batch.target, state.motions.value, found.nearest, state.association)
-    local = clustering.local_features(at, state.motions.active, scales)
+    local = clustering_unary(view, at, state.motions.value, state.motions.active, scales)
     pairwise = clustering.pairwise_features(batch.source, at, scales)
     possible = possible_clusters(state.motions.active, start.reach, batch.source.shape[1])
     potentials = clustering_potentials(local, pairwise, possible, parameters.clustering)
@@ -183,7 +194,7 @@ def update_association(view: PairView, state: State, found: Candidates, paramete
     batch, scales, boosters = view.batch, parameters.scales, parameters.boosters
     states = AssociationStates.of(view, found.index, found.mask, scales, boosters)
     moved = registered_points(batch.source, state.motions.value, state.motions.active, state.log_cluster)
-    unary = association_unary(states, moved, batch.target, scales, boosters)
+    unary = association_unary(view, states, moved, scales, boosters)
     pairwise = pairwise_features(batch.source, batch.target, found.index, scales)
     potentials = association_potentials(unary, pairwise, found.mask, parameters.association)
     log_association = chain_beliefs(*potentials, batch.source_mask, config.temperature)
@@ -322,8 +333,24 @@ def join(state: State, chosen: Tensor, low: int, high: int) -> State:
     return replace(state, cluster=cluster, log_cluster=torch.stack(columns, -1), motions=replace(state.motions, active=active))
 
 
-def read_out(state: State, converged: Tensor, iterations: Tensor) -> Prediction:
-    """The state as the user sees it."""
+def read_out(
+    view: PairView,
+    start: Start,
+    state: State,
+    parameters: Parameters,
+    config: InferenceConfig,
+    converged: Tensor,
+    iterations: Tensor,
+) -> Prediction:
+    """The state as the user sees it, and how sure it is."""
+    batch, motions = view.batch, state.motions.value
+    geometry = (batch.source, batch.target, start.target_tangents)
+    support = hard_support(*geometry, state.association, state.cluster, motions.shape[1])
+    scale = ROBUST_SHARE * parameters.scales.cluster_distance
+    sure = motion_covariance(
+        batch.source, support, motions, metric=config.motion_metric, scale=scale, noise=batch.range_noise
+    ).inflated(parameters.calibration.covariance_factor)
+    association_confidence, cluster_confidence = parameters.calibration(state)
     return Prediction(
         association=state.association,
         cluster=state.cluster,
@@ -334,4 +361,7 @@ def read_out(state: State, converged: Tensor, iterations: Tensor) -> Prediction:
         log_cluster=state.log_cluster,
         converged=converged,
         iterations=iterations,
+        association_confidence=association_confidence,
+        cluster_confidence=cluster_confidence,
+        uncertainty=sure,
     )

@@ -53,7 +53,7 @@ class LatticeChain(LatticeFeatures):
     known: Tensor
 
     def design(self) -> Design:
-        """The 30 features of every super-node at its true neighbours; state (j, k) is j D + k."""
+        """The 43 features of every super-node at its true neighbours; state (j, k) is j D + k."""
         D = self.mask.shape[3]
         features = self.moving.new_zeros(*self.mask.shape, WEIGHTS)
         features[..., list(STATIC_WEIGHTS)] = self.static[:, :, :, None]
@@ -75,7 +75,7 @@ class LatticeChain(LatticeFeatures):
         return sum(a[:, :, :, None] * c[:, :, None] for a, c in zip(of_association, of_cluster, strict=True))  # type: ignore[return-value]
 
     def log_likelihood(self, weights: Tensor) -> Tensor:
-        """(B,) exact log p(both true labellings | observation). weights: (30,)."""
+        """(B,) exact log p(both true labellings | observation). weights: (43,)."""
         potentials = self.potentials(weights).cut(self.known)
         return self._score(potentials) - lattice_log_partition(potentials)
 

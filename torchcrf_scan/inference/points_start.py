@@ -8,7 +8,8 @@ from torch import Tensor
 from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.candidates import by_motion
-from torchcrf_scan.features.potentials import PairView, clustering_potentials, possible_clusters
+from torchcrf_scan.features.potentials import PairView, possible_clusters
+from torchcrf_scan.features.scales import CLUSTERING_UNARY
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
@@ -17,6 +18,7 @@ from torchcrf_scan.inference.joint import Parameters
 from torchcrf_scan.inference.messages import chain_beliefs
 from torchcrf_scan.inference.paper_start import FEWEST, match_cold
 
+PAPERS_UNARY = 4  # C1..C4; the extensions are not for so many clusters
 EDGES = 16  # whose transition tables are made at once: one has D^2 entries of 8 features
 
 
@@ -55,9 +57,8 @@ def cluster_by_point(view: PairView, b: int, background: Tensor, association: Te
     nearest = by_motion(source, target, batch.target_mask[b : b + 1], motions, active, 1).nearest
     at = clustering.correspond(source, target, motions, nearest, association[None])
     local = clustering.local_features(at, active, parameters.scales)
-    log_unary = clustering_potentials(
-        local, local.new_zeros(1, 0, 1, 1, 8), possible_clusters(active, None, source.shape[1]), parameters.clustering
-    )[0]
+    possible = possible_clusters(active, None, source.shape[1])
+    log_unary = (local @ parameters.clustering[:PAPERS_UNARY]).masked_fill(~possible, -torch.inf)
     log_pairwise = edge_potentials(source, at, parameters)
     mask = batch.source_mask[b : b + 1]
     label = chain_beliefs(log_unary, log_pairwise, mask).argmax(-1)[0]  # that of the outlier is no cluster here
@@ -74,5 +75,6 @@ def edge_potentials(source: Tensor, at: clustering.Correspondence, parameters: P
     for begin in range(0, source.shape[1] - 1, EDGES):
         nodes = slice(begin, begin + EDGES + 1)
         part = clustering.Correspondence(at.moved[:, nodes], at.residual[:, nodes], at.partner[:, nodes], at.is_inlier[:, nodes])
-        parts.append(clustering.pairwise_features(source[:, nodes], part, parameters.scales) @ parameters.clustering[4:])
+        features = clustering.pairwise_features(source[:, nodes], part, parameters.scales)
+        parts.append(features @ parameters.clustering[CLUSTERING_UNARY:])
     return torch.cat(parts, dim=1)

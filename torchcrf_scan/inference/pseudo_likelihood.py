@@ -23,6 +23,7 @@ from torchcrf_scan.features.potentials import (
     Boosters,
     PairView,
     association_unary,
+    clustering_unary,
     find_candidates,
     possible_clusters,
     registered_points,
@@ -135,7 +136,7 @@ def _truth_of(batch: ScanPairBatch) -> Truth:
 
 
 def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> Chain:
-    """The association chain's 14 + 4 features; states are the candidates of the decoding and the truth."""
+    """The association chain's 19 + 4 features; states are the candidates of the decoding and the truth."""
     batch = view.batch
     truth = _truth_of(batch)
     found = find_candidates(view, plugins.motions, plugins.active, config)
@@ -144,24 +145,24 @@ def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters
     C = plugins.motions.shape[1]
     one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), C + 1).to(batch.source.dtype)
     moved = registered_points(batch.source, plugins.motions, plugins.active, one_hot)
-    unary = association_unary(states, moved, batch.target, scales, boosters)
+    unary = association_unary(view, states, moved, scales, boosters)
     pairwise = pairwise_features(batch.source, batch.target, index, scales)
     known = truth.known & batch.source_mask
     return Chain(unary, pairwise, state_mask(mask), label, known)
 
 
 def association_design(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> Design:
-    """The association chain's 18 features of every state at the true labels of its neighbours."""
+    """The association chain's 23 features of every state at the true labels of its neighbours."""
     return association_chain(view, plugins, scales, boosters, config).design()
 
 
 def clustering_chain(view: PairView, plugins: PlugIns, scales: Scales) -> Chain:
-    """The clustering chain's 4 + 8 features."""
+    """The clustering chain's 12 + 8 features."""
     batch = view.batch
     C = plugins.motions.shape[1]
     found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, 1)
     at = clustering.correspond(batch.source, batch.target, plugins.motions, found.nearest, plugins.association)
-    local = clustering.local_features(at, plugins.active, scales)
+    local = clustering_unary(view, at, plugins.motions, plugins.active, scales)
     pairwise = clustering.pairwise_features(batch.source, at, scales)
     label = torch.where(plugins.label >= 0, plugins.label, C)
     known = plugins.known & batch.source_mask
@@ -169,7 +170,7 @@ def clustering_chain(view: PairView, plugins: PlugIns, scales: Scales) -> Chain:
 
 
 def clustering_design(view: PairView, plugins: PlugIns, scales: Scales) -> Design:
-    """The clustering chain's 12 features of every state at the true labels of its neighbours."""
+    """The clustering chain's 20 features of every state at the true labels of its neighbours."""
     return clustering_chain(view, plugins, scales).design()
 
 

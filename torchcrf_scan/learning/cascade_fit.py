@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from torchcrf_scan.baselines.cascade import Cascade
 from torchcrf_scan.config import Config
@@ -23,6 +24,6 @@ def fit_cascade(material: Sequence[Material], config: Config, watch: Mapping[str
         unseen = copy.deepcopy(matching)
         unseen.boosters = margins[part.fold]
         start = Cascade(unseen, clustering).feed(part.batch, part.start)
-        fed.append(Material(part.batch, start, part.fold))
+        fed.append(replace(part, start=start))
     fit(clustering, fed, config.learning, watch.get("clustering"))
     return Cascade(matching, clustering)

@@ -188,7 +188,7 @@ def resample(scores: Sequence[PairScore], config: Config) -> Ints:
 
 
 def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: str, config: Config, run: RunLog) -> list[Table]:
-    """Overview, Tables I to III and the differences of one protocol, logged as well."""
+    """Overview, Tables I to III, how sure and the differences of one protocol, logged as well."""
     tables = report(scores, seconds=seconds, published=True)
     weights = resample(scores[JOINT], config)
     tables += [differences_table(name, scores, weights) for name in (JOINT, EXACT) if name in scores and len(scores) > 1]

@@ -1,4 +1,4 @@
-"""Learning a model from annotated pairs, stage by stage: start, scales, boosters, association weights, clustering weights.
+"""Learning a model from annotated pairs, stage by stage: scales, boosters, association weights, clustering weights, movers' worth.
 
 Everything that is fitted is fitted on the given pairs alone, so a fold of a cross-validation is one call.
 """
@@ -23,6 +23,7 @@ from torchcrf_scan.learning.boosting_fit import fit_boosters
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.scales_fit import fit_scales
+from torchcrf_scan.learning.selection_fit import fit_potential
 from torchcrf_scan.learning.weights_fit import Watch, fit_chain
 from torchcrf_scan.model import JointScanCRF
 
@@ -74,6 +75,8 @@ def fit(
     if chains != "matching":
         features = (clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True))
         set_weights(model, "clustering", fit_chain(features, live[1], config, watch.get("clustering")))
+    if chains == "joint":
+        model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
     return margins
 
 
@@ -166,10 +169,11 @@ def clustering_chain(
 
 @torch.no_grad()
 def set_weights(model: JointScanCRF, chain: str, values: Tensor) -> None:
-    """Writes (18,) or (12,) weights into the named parameters."""
+    """Writes (23,) or (20,) weights into the named parameters; what the model does not have is 0 there."""
     names, weights = {
         "association": (ASSOCIATION_WEIGHTS, model.association_weights),
         "clustering": (CLUSTERING_WEIGHTS, model.clustering_weights),
     }[chain]
     for name, value in zip(names, values, strict=True):
-        weights[name].copy_(value)
+        if name in weights:
+            weights[name].copy_(value)

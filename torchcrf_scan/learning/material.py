@@ -22,11 +22,12 @@ PART = 4  # pairs that one job looks at
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """A batch of annotated pairs with its start; `fold` is its part of the out-of-fold margins."""
+    """A batch of annotated pairs with its start; `fold` is its part of the out-of-fold margins, `pairs` are undisturbed."""
 
     batch: ScanPairBatch
     start: Start
     fold: int
+    pairs: tuple[ScanPair, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,20 +35,28 @@ class Collection:
     """Annotated pairs with all that takes long to find and depends neither on other pairs nor on anything learned.
 
     Attributes:
-        names, sequences: of every pair.
-        batch: all P pairs, disturbed as moving sensors disturb them.
+        pairs: all P pairs as they are. batch: the same, disturbed as moving sensors disturb them.
         surveys: P what InitialiseRT looks at in the disturbed pairs.
         views: P lists of what the movers' score is fitted on.
     """
 
-    names: tuple[str, ...]
-    sequences: tuple[str, ...]
+    pairs: tuple[ScanPair, ...]
     batch: ScanPairBatch
     surveys: tuple[Survey | None, ...]
     views: tuple[list[HypothesisView], ...]
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self.pairs)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of every pair."""
+        return tuple(pair.name for pair in self.pairs)
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Of every pair."""
+        return tuple(pair.sequence for pair in self.pairs)
 
     def fit_score(self, index: Iterable[int]) -> HypothesisScore:
         """The score of movers' hypotheses, fitted on some of the pairs."""
@@ -58,14 +67,15 @@ class Collection:
 
         clusters: C, background included.
         """
-        folds = assign_folds([self.sequences[k] for k in index], config.folds)
+        folds = assign_folds([self.pairs[k].sequence for k in index], config.folds)
         material = []
         for fold in sorted(set(folds)):
             part = [k for k, of in zip(index, folds, strict=True) if of == fold]
             for begin in range(0, len(part), config.batch_size):
                 rows = part[begin : begin + config.batch_size]
                 batch = self.batch.select(torch.tensor(rows))
-                material.append(Material(batch, choose(batch, [self.surveys[k] for k in rows], score, clusters), fold))
+                start = choose(batch, [self.surveys[k] for k in rows], score, clusters)
+                material.append(Material(batch, start, fold, tuple(self.pairs[k] for k in rows)))
         return material
 
 
@@ -92,8 +102,7 @@ def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) ->
     for of_surveys, of_views in tqdm(found, total=len(parts), desc="InitialiseRT", unit="batch", leave=False):
         surveys += of_surveys
         views += of_views
-    names, sequences = tuple(pair.name for pair in pairs), tuple(pair.sequence for pair in pairs)
-    return Collection(names, sequences, batch, tuple(surveys), tuple(views))
+    return Collection(tuple(pairs), batch, tuple(surveys), tuple(views))
 
 
 def _look(

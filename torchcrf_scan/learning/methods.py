@@ -23,6 +23,7 @@ from torchcrf_scan.config import Config, LearningConfig, ModelConfig
 from torchcrf_scan.features.scales import LOCAL_CHANNELS
 from torchcrf_scan.inference.initialise import Start, nearest_association
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
+from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.cascade_fit import fit_cascade
 from torchcrf_scan.learning.fit import Margins, fit
 from torchcrf_scan.learning.material import Collection, collect
@@ -84,7 +85,9 @@ class Answer:
 
 
 def fit_models(study: Study, train: Sequence[int], config: Config, variants: bool) -> Models:
-    """Refits everything on the pairs `train`: the movers' score, scales, boosters, weights, and ICP's gate.
+    """Refits everything on the pairs `train`: the movers' score, scales, boosters, weights, confidences, and ICP's gate.
+
+    Models for ablations are not calibrated: nobody asks how sure they are, and some take minutes a pair.
 
     variants: of the joint model as well, see `joint_variants`.
     """
@@ -98,10 +101,12 @@ def fit_models(study: Study, train: Sequence[int], config: Config, variants: boo
     if config.experiment.joint_alone:
         _fitted_features.setdefault(key, (joint, margins))
         return Models(models)
-    for name, model, learning in joint_variants(config) if variants else []:
-        models[name] = JointScanCRF(model)
+    for name, variant, learning in joint_variants(config) if variants else []:
+        models[name] = JointScanCRF(variant)
         models[name].hypothesis_score = score
         fit(models[name], material, learning, features_of=(joint, margins))
+    for model in models.values():
+        calibrate(model, material)
     cascade = fit_cascade(material, config)
     return Models(models, cascade, choose_gate(study.icp_shares[list(train)], GATES))
 

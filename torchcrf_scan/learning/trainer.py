@@ -24,6 +24,7 @@ from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import Table, report
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.cascade_fit import fit_cascade
 from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.material import Material, collect
@@ -95,8 +96,9 @@ def refuse_leaks(train_pairs: Sequence[ScanPair], test_pairs: Sequence[ScanPair]
 
 
 def fit_methods(model: JointScanCRF, material: list[Material], config: Config, run: RunLog) -> dict[str, Decoder]:
-    """Fits the joint model, and each chain alone where asked for, from the same start."""
+    """Fits the joint model and how sure it is, and each chain alone where asked for, from the same start."""
     fit(model, material, config.learning, watches(run, "joint"))
+    calibrate(model, material)
     decoders: dict[str, Decoder] = {"joint": model}
     if config.compare_chains and config.model.chains == "joint":
         cascade = fit_cascade(material, config, {method: watches(run, method) for method in ("matching", "clustering")})

@@ -1,0 +1,99 @@
+"""Which hypothesised movers there are: decided by the clustering chain and the hypotheses' scores together (design finding 14).
+
+Every hypothesis begins as a cluster, the paper's "start with many clusters, discard the vacuous". A cluster stays if what it
+explains that no other cluster does, and what its score says of it, weigh enough:
+
+    bias + explains * log(1 + log Z of the chain with it - log Z without it) + score * log-odds of the hypothesis > 0
+
+The least worth of a pair goes first, for two that explain the same points are each worthless while the other is there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from torchcrf_scan.config import InferenceConfig
+from torchcrf_scan.features import clustering
+from torchcrf_scan.features.potentials import PairView, clustering_potentials, clustering_unary, find_candidates, possible_clusters
+from torchcrf_scan.inference.messages import log_partition, silence_padding
+
+if TYPE_CHECKING:
+    from torchcrf_scan.inference.initialise import Start
+    from torchcrf_scan.inference.joint import Parameters, State
+
+CAPPED = 5.0  # log-odds; a hypothesis is never surer than this
+
+
+class ClusterPotential(nn.Module):
+    """The log-linear worth of a mover's cluster; its three named weights are fitted with the rest (`learning.selection_fit`).
+
+    Attributes:
+        explains: () of log(1 + what the cluster adds to the clustering chain's log Z).
+        score: () of the hypothesis' log-odds. bias: ().
+    """
+
+    explains: Tensor
+    score: Tensor
+    bias: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("explains", torch.tensor(1.0))
+        self.register_buffer("score", torch.tensor(1.0))
+        self.register_buffer("bias", torch.tensor(-2.0))
+
+    def forward(self, evidence: Tensor, log_odds: Tensor) -> Tensor:
+        """(...) worth; a cluster below 0 is dropped. evidence, log_odds: (...)."""
+        explained, scored = self.terms(evidence, log_odds).unbind(-1)
+        return self.bias + self.explains * explained + self.score * scored
+
+    @staticmethod
+    def terms(evidence: Tensor, log_odds: Tensor) -> Tensor:
+        """(..., 2) what the weights belong to."""
+        return torch.stack([evidence.clamp(min=0).log1p(), log_odds.clamp(-CAPPED, CAPPED)], dim=-1)
+
+
+@torch.no_grad()
+def discard_vacuous(view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig) -> State:
+    """The state without the clusters that are worth less than nothing. Movers only; needs `start.log_odds`."""
+    assert start.log_odds is not None
+    for _ in range(state.motions.active.shape[1] - 1):
+        worth = parameters.potential(evidence(view, start, state, parameters, config), start.log_odds)  # (B, C)
+        is_mover = torch.arange(worth.shape[1], device=worth.device) > 0
+        least, which = worth.masked_fill(~(state.motions.active & is_mover), torch.inf).min(-1)
+        is_vacuous = torch.nn.functional.one_hot(which, worth.shape[1]).bool() & (least < 0)[:, None]
+        if not bool(is_vacuous.any()):
+            break
+        state = replace(state, motions=replace(state.motions, active=state.motions.active & ~is_vacuous))
+    return state
+
+
+@torch.no_grad()
+def evidence(view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig) -> Tensor:
+    """(B, C) log Z of the clustering chain at the present motions and associations, minus that without the cluster; 0: absent.
+
+    Without it, its points still count as explained (C2), else its absence would speak for them being outliers.
+    """
+    batch, motions = view.batch, state.motions
+    found = find_candidates(view, motions.value, motions.active, config)
+    at = clustering.correspond(batch.source, batch.target, motions.value, found.nearest, state.association)
+    local = clustering_unary(view, at, motions.value, motions.active, parameters.scales)
+    pairwise = clustering.pairwise_features(batch.source, at, parameters.scales)
+
+    def log_total(active: Tensor) -> Tensor:
+        possible = possible_clusters(active, start.reach, batch.source.shape[1])
+        potentials = clustering_potentials(local, pairwise, possible, parameters.clustering)
+        return log_partition(*silence_padding(*potentials, batch.source_mask))
+
+    whole = log_total(motions.active)
+    columns = [torch.zeros_like(whole)]
+    for k in range(1, motions.active.shape[1]):
+        without = motions.active.clone()
+        without[:, k] = False
+        is_there = bool(motions.active[:, k].any())
+        columns.append(whole - log_total(without) if is_there else torch.zeros_like(whole))
+    return torch.stack(columns, dim=1)
