@@ -216,6 +216,98 @@ def pairwise_clustering(
     return out
 
 
+# Extensions. A scan is (points in beam order, origin, closed, noise).
+
+
+def look(scan: tuple[Sequence[Sequence[float]], Sequence[float], bool, float], point: Sequence[float]) -> tuple[float, float]:
+    """How far a scan sees through a point and how far it hides it."""
+    points, origin, closed, noise = scan
+    arms = [(p[0] - origin[0], p[1] - origin[1]) for p in points]
+    ranges, bearings = [math.hypot(*arm) for arm in arms], [math.atan2(arm[1], arm[0]) for arm in arms]
+    turns = [(after - before) % (2 * math.pi) for before, after in itertools.pairwise(bearings)]
+    step = sorted(turns)[(len(turns) - 1) // 2] if turns else math.radians(0.5)
+    if len(points) == 0:
+        return 0.0, 0.0
+    arm = (point[0] - origin[0], point[1] - origin[1])
+    mine = math.hypot(*arm)
+    onward = (math.atan2(arm[1], arm[0]) - bearings[0]) % (2 * math.pi)  # from the first beam
+    span = sum(turns)
+    if closed or onward < span:
+        begin, beams = 0.0, [*range(len(points)), 0]
+        for left, right in itertools.pairwise(beams if closed else beams[:-1]):
+            width = turns[left] if right else 2 * math.pi - span
+            if begin <= onward <= begin + width:
+                break
+            begin += width
+        if max(onward - begin, begin + width - onward) >= 2.5 * step:
+            return 0.0, 0.0
+    elif min(onward - span, 2 * math.pi - onward) > step / 2:
+        return 0.0, 1.0
+    else:
+        left = right = 0 if 2 * math.pi - onward < step / 2 else len(points) - 1
+    slack = max(3 * (noise + mine * step) + 0.02 * mine, 1e-6)
+    return tuple(  # type: ignore[return-value]
+        min(max(beyond / slack - 1, 0.0), 1.0)
+        for beyond in (min(ranges[left], ranges[right]) - mine, mine - max(ranges[left], ranges[right]))
+    )
+
+
+def past_gate(distance: float, gate: float) -> float:
+    return 1 / (1 + math.exp(-(distance / gate - 1) / 0.05))
+
+
+def association_extension(
+    distances: Sequence[float], real: Sequence[bool], sight: Sequence[float], cluster_distance: float, gate: float
+) -> np.ndarray:
+    """(K+1, 5) of one point: excess, gate, outlier bias, outlier seen through, outlier hidden."""
+    nearest = min([d for d, is_real in zip(distances, real, strict=True) if is_real], default=math.inf)
+    rows = [[-min(max((d - nearest) / cluster_distance, 0.0), 3.0), -past_gate(d, gate), 0, 0, 0] for d in distances]
+    return np.array([*rows, [0, 0, 1, *sight]], dtype=float)
+
+
+def clustering_extension(
+    residuals: Sequence[float],
+    ahead: Sequence[Sequence[float]],
+    back: Sequence[Sequence[float]],
+    gate: float,
+    is_inlier: bool,
+) -> np.ndarray:
+    """(D, 8) of one point: gate, outlier bias, seen through, so back, hidden, so back, outlier seen through, outlier hidden."""
+    rows = []
+    for residual, (seen, hidden), (seen_back, hidden_back) in zip(residuals, ahead, back, strict=True):
+        of_partner = (seen_back, hidden_back) if is_inlier else (0.0, 0.0)
+        rows.append([-past_gate(residual, gate), 0, -seen, -of_partner[0], -hidden, -of_partner[1], 0, 0])
+    return np.array([*rows, [0, 1, 0, 0, 0, 0, *ahead[0]]], dtype=float)
+
+
+def invert(motion: Sequence[float], point: Sequence[float]) -> tuple[float, float]:
+    """Where the point came from."""
+    theta, tx, ty = motion
+    return move((-theta, 0.0, 0.0), (point[0] - tx, point[1] - ty))
+
+
+def lattice_extension(
+    source: np.ndarray, target: np.ndarray, motions: np.ndarray, possible: np.ndarray, scales: dict[str, Any], noise: float
+) -> np.ndarray:
+    """(N, A D, 13) extensions of every super-node, the association's before the clustering's; open scans seen from 0."""
+    N, M, C = len(source), len(target), len(motions)
+    before, after = (source, (0.0, 0.0), False, noise), (target, (0.0, 0.0), False, noise)
+    out = np.zeros((N, M + 1, C + 1, 13))
+    for i in range(N):
+        moved = [move(g, source[i]) for g in motions]
+        apart = [[math.dist(p, q) for q in target] for p in moved]
+        ahead = [look(after, p) for p in moved]
+        best = [min(apart[k][j] for k in range(C) if possible[i, k]) for j in range(M)]
+        for k in range(C + 1):
+            own, sight = (apart[k], ahead[k]) if k < C else (best, ahead[0])
+            out[i, :, k, :5] = association_extension(own, [True] * M, sight, scales["cluster_distance"], scales["gate"])
+        for j in range(M + 1):
+            residuals = [row[j] if j < M else min(row) for row in apart]
+            back = [look(before, invert(g, target[j % M])) for g in motions]
+            out[i, j, :, 5:] = clustering_extension(residuals, ahead, back, scales["gate"], j < M)
+    return out.reshape(N, -1, 13)
+
+
 def stump_sum(
     phi: Sequence[float], feature: Sequence[int], threshold: Sequence[float], left: Sequence[float], right: Sequence[float]
 ) -> float:

@@ -6,6 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+# Where the paper's weights are among all; between them stand the extensions' (`features.scales`).
+PAPER_ASSOCIATION = [*range(14), *range(19, 23)]
+PAPER_CLUSTERING = [*range(4), *range(12, 20)]
+PAPER_WEIGHTS = [*PAPER_ASSOCIATION, *(23 + k for k in PAPER_CLUSTERING)]  # of both chains in a row
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-9}  # relative and absolute
 
 
@@ -24,6 +28,17 @@ def generator(seed: int) -> torch.Generator:
 def normal(*shape: int, seed: int = 0) -> Tensor:
     """Standard normal float64 numbers."""
     return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+
+
+def extended(weights: Tensor) -> Tensor:
+    """The paper's 18, 12 or 30 weights among those of the extensions, which are 0: (23,), (20,) or (43,)."""
+    places = {len(where): where for where in (PAPER_ASSOCIATION, PAPER_CLUSTERING, PAPER_WEIGHTS)}[len(weights)]
+    return weights.new_zeros(places[-1] + 1).index_put((torch.tensor(places),), weights)
+
+
+def paper_weights(association_seed: int, clustering_seed: int) -> tuple[Tensor, Tensor]:
+    """(23,) and (20,): random weights of the paper's features, none of the extensions'."""
+    return extended(normal(18, seed=association_seed)), extended(normal(12, seed=clustering_seed))
 
 
 def make_points(n: int, seed: int = 0, *, closed: bool = False) -> Tensor:

@@ -5,11 +5,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from jsonargparse import ArgumentParser
+from support import PAPER_WEIGHTS
 
 from torchcrf_scan.commands.experiment import read_variants
 from torchcrf_scan.config import WEIGHTS, Config, ExperimentConfig, FeatureConfig, InferenceConfig, LearningConfig, ModelConfig
+from torchcrf_scan.features.scales import live_weights
+from torchcrf_scan.model import JointScanCRF
 
+PAPER = FeatureConfig(free_space=False, decisions=False, left_out=())
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 FILES = sorted(path.name for path in CONFIGS.glob("*.yaml"))
 
@@ -52,11 +57,13 @@ def test_the_paper_is_the_paper() -> None:
     assert not config.model.features.wrap_closed
     assert config.model.features.stumps == 50
     assert config.learning.negatives == 10
+    assert len(list(JointScanCRF(config.model).parameters())) == 30
+    assert bool(torch.cat(live_weights(config.model.features))[PAPER_WEIGHTS].all())  # and none of them is left out
 
 
 def test_the_literal_reading_changes_one_feature() -> None:
     config = load("literal.yaml")
-    assert config.model.features == FeatureConfig(raw_channels=False)
+    assert config.model.features == replace(PAPER, raw_channels=False)
     assert config.model.inference == InferenceConfig()
     assert config.learning == LearningConfig()
 
@@ -114,7 +121,7 @@ def test_every_feature_is_left_out_in_turn(variants: dict[str, Config]) -> None:
     for name, config in without.items():
         features = replace(paper.model.features, left_out=(name,))
         assert config == replace(paper, model=replace(paper.model, features=features))
-    assert set(without) == set(WEIGHTS)
+    assert set(without) == {WEIGHTS[k] for k in PAPER_WEIGHTS}
 
 
 def test_a_variant_keeps_what_it_does_not_name(tmp_path: Path) -> None:
@@ -154,5 +161,5 @@ def test_values_out_of_range_are_named(config: type, name: str, value: object) -
 
 
 def test_every_weight_can_be_left_out() -> None:
-    assert len(set(WEIGHTS)) == 30
+    assert len(set(WEIGHTS)) == 43
     assert FeatureConfig(left_out=WEIGHTS).left_out == WEIGHTS

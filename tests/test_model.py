@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support import assert_close, make_points, normal
+from support import PAPER_ASSOCIATION, PAPER_CLUSTERING, assert_close, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan import (
@@ -38,6 +38,14 @@ CLUSTERING = (
     *("neighbour_weight_same", "neighbour_weight_different", "neighbour_stiffness_same", "neighbour_stiffness_different"),
     *("neighbour_distance_same", "neighbour_distance_different", "pairwise_outlier"),
 )
+ASSOCIATION_EXTENSION = ("excess", "gate", "outlier_bias", "outlier_seen_through", "outlier_hidden")
+CLUSTERING_EXTENSION = (
+    *("gate", "outlier_bias", "seen_through", "seen_through_back", "hidden", "hidden_back"),
+    *("outlier_seen_through", "outlier_hidden"),
+)
+FREE_SPACE = ("seen_through", "hidden")  # all names of such weights have one of them
+PAPER = FeatureConfig(free_space=False, decisions=False, left_out=())
+EVERYTHING = FeatureConfig(left_out=())
 SOFT = {"motion_weights": "soft", "temperature": 1.0, "stop_early": False, "candidates": 0}
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3]], dtype=torch.float64)
 
@@ -99,43 +107,87 @@ def assert_equal(found: PairPrediction, expected: PairPrediction) -> None:
 
 
 def test_thirty_named_weights_in_the_papers_order() -> None:
-    model = JointScanCRF()
-    assert tuple(ASSOCIATION_WEIGHTS) == ASSOCIATION
-    assert tuple(CLUSTERING_WEIGHTS) == CLUSTERING
+    model = JointScanCRF(ModelConfig(features=PAPER))
+    assert tuple(ASSOCIATION_WEIGHTS[k] for k in PAPER_ASSOCIATION) == ASSOCIATION
+    assert tuple(CLUSTERING_WEIGHTS[k] for k in PAPER_CLUSTERING) == CLUSTERING
     assert set(model.association_weights) == set(ASSOCIATION)
     assert set(model.clustering_weights) == set(CLUSTERING)
     assert (len(ASSOCIATION), len(CLUSTERING)) == (18, 12)
     assert len(list(model.parameters())) == 30
     assert all(weight.shape == () for weight in model.parameters())
-    assert [len(vector) for vector in model.weight_vectors] == [18, 12]
+    assert [len(vector) for vector in model.weight_vectors] == [23, 20]
 
 
 def test_the_parameters_keep_the_papers_order() -> None:
-    model = JointScanCRF()
+    model = JointScanCRF(ModelConfig(features=PAPER))
     assert tuple(model.association_weights) == ASSOCIATION
     assert tuple(model.clustering_weights) == CLUSTERING
 
 
+def test_thirteen_more_weights_stand_between_unary_and_pairwise_ones() -> None:
+    model = JointScanCRF()
+    assert tuple(ASSOCIATION_WEIGHTS) == (*ASSOCIATION[:14], *ASSOCIATION_EXTENSION, *ASSOCIATION[14:])
+    assert tuple(CLUSTERING_WEIGHTS) == (*CLUSTERING[:4], *CLUSTERING_EXTENSION, *CLUSTERING[4:])
+    assert tuple(model.association_weights) == ASSOCIATION_WEIGHTS
+    assert tuple(model.clustering_weights) == CLUSTERING_WEIGHTS
+    assert len(list(model.parameters())) == 43
+
+
+@pytest.mark.parametrize("free_space", [True, False])
+@pytest.mark.parametrize("decisions", [True, False])
+def test_each_group_of_extensions_has_a_switch(free_space: bool, decisions: bool, tmp_path: Path) -> None:
+    features = FeatureConfig(free_space=free_space, decisions=decisions, left_out=())
+    model = randomise(JointScanCRF(ModelConfig(features=features)))
+    has = {True: free_space, False: decisions}
+    for names, paper, weights, vector in (
+        (ASSOCIATION_WEIGHTS, ASSOCIATION, model.association_weights, model.weight_vectors[0]),
+        (CLUSTERING_WEIGHTS, CLUSTERING, model.clustering_weights, model.weight_vectors[1]),
+    ):
+        own = [name for name in names if name in paper or has[any(part in name for part in FREE_SPACE)]]
+        assert list(weights) == own
+        assert [name for name, value in zip(names, vector.tolist(), strict=True) if value != 0] == own
+    assert len(list(model.parameters())) == 30 + 5 * decisions + 8 * free_space
+    model.save_pretrained(tmp_path)
+    again = JointScanCRF.from_pretrained(tmp_path)
+    assert again.config == model.config
+    assert again.state_dict().keys() == model.state_dict().keys()
+    for found, expected in zip(again.weight_vectors, model.weight_vectors, strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_without_extensions_their_weights_pass_no_gradient_and_change_nothing() -> None:
+    small, large = (JointScanCRF(ModelConfig(features=features)).double() for features in (PAPER, EVERYTHING))
+    with torch.no_grad():
+        for name, weight in small.named_parameters():
+            dict(large.named_parameters())[name].copy_(weight)
+    batch, start = tiny()
+    one, other = small(batch, start), large(batch, start)  # new extensions weigh nothing
+    assert torch.equal(one.log_association, other.log_association)
+    assert torch.equal(one.log_cluster, other.log_cluster)
+    assert torch.equal(one.motions, other.motions)
+
+
 @pytest.mark.parametrize("layer", [JointScanCRF, MatchingCRF, ClusteringCRF])
 def test_weight_vectors_follow_the_names(layer: type[JointScanCRF]) -> None:
-    model = layer()
+    model = layer(ModelConfig(features=EVERYTHING))
     with torch.no_grad():
         for k, weight in enumerate(model.parameters()):
             weight.fill_(k)
     numbered = dict(model.named_parameters())
     association, clustering = model.weight_vectors
-    assert_close(association.detach(), torch.stack([numbered[f"association_weights.{name}"] for name in ASSOCIATION]).detach())
-    assert_close(clustering.detach(), torch.stack([numbered[f"clustering_weights.{name}"] for name in CLUSTERING]).detach())
+    assert association.tolist() == [numbered[f"association_weights.{name}"].item() for name in ASSOCIATION_WEIGHTS]
+    assert clustering.tolist() == [numbered[f"clustering_weights.{name}"].item() for name in CLUSTERING_WEIGHTS]
 
 
 def test_the_literal_reading_switches_the_raw_channels_off() -> None:
-    model = JointScanCRF(ModelConfig(features=FeatureConfig(raw_channels=False)))
+    model = JointScanCRF(ModelConfig(features=replace(PAPER, raw_channels=False)))
     with torch.no_grad():
         for weight in model.parameters():
             weight.fill_(2.0)
     association, clustering = model.weight_vectors
-    assert association.tolist() == [0.0] * 12 + [2.0] * 6
-    assert clustering.tolist() == [2.0] * 12
+    assert association[PAPER_ASSOCIATION].tolist() == [0.0] * 12 + [2.0] * 6
+    assert clustering[PAPER_CLUSTERING].tolist() == [2.0] * 12
+    assert sum(association.tolist() + clustering.tolist()) == 36.0  # the rest are 0
     association.sum().backward()
     assert [float(model.association_weights[name].grad) for name in ASSOCIATION] == [0.0] * 12 + [1.0] * 6
 
@@ -223,7 +275,7 @@ def test_state_dict_round_trip() -> None:
     for name, value in model.state_dict().items():
         assert torch.equal(again.state_dict()[name], value), name
     buffers = {name.split(".")[0] for name, _ in model.named_buffers()}
-    assert buffers == {"scales", "boosters", "hypothesis_score"}
+    assert buffers == {"scales", "boosters", "hypothesis_score", "calibration", "cluster_potential"}
 
 
 # --- answers ------------------------------------------------------------------------------------------------------------------
@@ -319,10 +371,11 @@ def test_a_still_scan_stays() -> None:
 # --- gradients ----------------------------------------------------------------------------------------------------------------
 
 
-def soft_model(metric: str, iterations: int = 2) -> JointScanCRF:
+def soft_model(metric: str, iterations: int = 2, **features: bool) -> JointScanCRF:
+    """Every feature but those named; lengths in metres, as no gradient passes through the choice of a unit."""
     settings = InferenceConfig(clusters=3, iterations=iterations, motion_metric=metric, min_extent=0.0, **SOFT)  # type: ignore[arg-type]
-    features = FeatureConfig(length_unit="metre")  # no gradient passes through the choice of a unit
-    model = JointScanCRF(ModelConfig(features=features, inference=settings)).double()
+    own = replace(EVERYTHING, length_unit="metre", **features)
+    model = JointScanCRF(ModelConfig(features=own, inference=settings)).double()
     model.scales.local.fill_(2.0)  # no error is capped
     model.scales.pairwise.fill_(2.0)
     for name in ("cluster_distance", "neighbour_distance", "neighbour_weight"):
@@ -357,7 +410,8 @@ def test_gradients_reach_weights_and_points(what: str, metric: str) -> None:
     boosted = {"association_weights.data_boosting", "association_weights.outlier_boosting"}  # nothing is boosted yet
     threshold = {"clustering_weights.outlier"}  # every point is explained
     both = {"clustering_weights.cluster_inlier_out"}  # none is an outlier
-    assert silent <= boosted | threshold | both
+    unseen = {name for name in slopes if any(part in name for part in FREE_SPACE)}  # no point is in front of a beam or behind it
+    assert silent - unseen <= boosted | threshold | both
 
 
 def test_gradients_of_padded_simulated_pairs_are_finite(pairs: list[ScanPair]) -> None:
@@ -392,7 +446,7 @@ def test_gradcheck_of_the_unrolled_rounds_in_the_weights(metric: str) -> None:
 @pytest.mark.parametrize("metric", ["point", "line"])
 def test_gradcheck_of_the_unrolled_rounds_in_the_points(metric: str) -> None:
     batch, start = tiny(6)
-    model = soft_model(metric)
+    model = soft_model(metric, free_space=False)  # no gradient passes through what the beams say
 
     def answers(source: Tensor, target: Tensor) -> tuple[Tensor, ...]:
         found = model(replace(batch, source=source, target=target), start)

@@ -161,6 +161,36 @@ SCALES = {
 }
 
 
+def test_look() -> None:
+    wall = ([(2.0, -0.2), (2.0, 0.0), (2.0, 0.2)], (0.0, 0.0), False, 0.0)
+    assert oracles.look(wall, (1.0, 0.05)) == (1, 0)
+    assert oracles.look(wall, (2.0, 0.05)) == (0, 0)
+    assert oracles.look(wall, (9.0, 0.05)) == (0, 1)
+    assert oracles.look(wall, (-1.0, 0.0)) == (0, 1)  # nobody looks there
+    step = math.atan2(0.2, 2.0)
+    slack = 1.6 * (3 * step + 0.02)
+    assert oracles.look(wall, (1.6, 0.0))[0] == pytest.approx(max(0.4 / slack - 1, 0))
+    ring = ([(2.0, 0.0), (0.0, 2.0), (-2.0, 0.0), (0.0, -2.0)], (0.0, 0.0), True, 0.0)
+    assert oracles.look(ring, (0.1, -0.1)) == (1, 0)
+    assert oracles.look(([], (0.0, 0.0), False, 0.0), (1.0, 0.0)) == (0, 0)
+    moved = ([(p[0] + 5, p[1]) for p in wall[0]], (5.0, 0.0), False, 0.0)
+    assert oracles.look(moved, (6.0, 0.05)) == (1, 0)
+
+
+def test_extensions_of_a_point() -> None:
+    found = oracles.association_extension([0.1, 0.3, 9.0], [False, True, True], (0.5, 0.25), 0.5, 0.3)
+    assert found[0, 0] == 0
+    assert found[1].tolist() == [0, -0.5, 0, 0, 0]
+    assert found[2].tolist() == pytest.approx([-3, -1, 0, 0, 0])
+    assert found[3].tolist() == [0, 0, 1, 0.5, 0.25]
+    ahead, back = [(0.1, 0.2), (0.3, 0.4)], [(0.5, 0.6), (0.7, 0.8)]
+    partnered, alone = (oracles.clustering_extension([0.3, 9.0], ahead, back, 0.3, inlier) for inlier in (True, False))
+    assert partnered[0].tolist() == [-0.5, 0, -0.1, -0.5, -0.2, -0.6, 0, 0]
+    assert alone[1].tolist() == pytest.approx([-1, 0, -0.3, 0, -0.4, 0, 0, 0])
+    assert partnered[2].tolist() == alone[2].tolist() == [0, 1, 0, 0, 0, 0, 0.1, 0.2]
+    assert oracles.invert((math.pi / 2, 1.0, 0.0), (1.0, 3.0)) == pytest.approx((3, 0))
+
+
 def test_lattice_local() -> None:
     data, outlier = ([11], [-0.5], [-1.0], [1.0]), ([11], [-0.5], [2.0], [3.0])
     possible = np.array([[True, True], [True, False], [True, True]])

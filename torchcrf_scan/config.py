@@ -83,6 +83,8 @@ WORLDS = {
     "model_cars_dominant": replace(MODEL_CARS, dominant_mover=0.5, aperture=0.5),
     "indoor": SimulatorConfig(scene="indoor", range_max=30.0, ego_translation=0.4),
     "street_dominant": SimulatorConfig(dominant_mover=0.5, aperture=0.5),
+    "still_street": SimulatorConfig(movers_min=0, movers_max=0),
+    "still_indoor": SimulatorConfig(scene="indoor", range_max=30.0, ego_translation=0.4, movers_min=0, movers_max=0),
 }
 
 
@@ -108,6 +110,8 @@ class InferenceConfig:
         motion_weights: `hard` (labels, the paper's) or `soft` (beliefs; lets gradients reach the weights).
         motion_metric: `point` (Kabsch, the paper's) or `line` (robust point-to-line step); or `given`: the motions stay those of
             the start (in the `sweep`).
+        movers: `joint`: the clustering chain has its say in which hypothesised movers there are; `threshold`: their score decides
+            (so in `flooding`).
         min_extent: metres (in the unit `spacing`, those of a street scanner); a smaller cluster takes the background's rotation.
         rotation_tolerance: radians below which a motion has settled.
         translation_tolerance: metres below which a motion has settled.
@@ -123,6 +127,7 @@ class InferenceConfig:
     temperature: float = 0.0
     motion_weights: str = "hard"
     motion_metric: str = "line"
+    movers: str = "joint"
     min_extent: float = 0.1
     rotation_tolerance: float = 1e-4
     translation_tolerance: float = 1e-3
@@ -132,6 +137,7 @@ class InferenceConfig:
         _choose("schedule", self.schedule, ("sweep", "flooding"))
         _choose("flooding_order", self.flooding_order, ("alternate", "ascending"))
         _choose("motion_weights", self.motion_weights, ("hard", "soft"))
+        _choose("movers", self.movers, ("joint", "threshold"))
         _choose("motion_metric", self.motion_metric, ("point", "line", "given"))
         if self.clusters < 2:
             raise ValueError(f"clusters: expected at least 2 (background and outlier), got {self.clusters}")
@@ -151,15 +157,21 @@ class FeatureConfig:
         length_unit: what lengths are measured in: `spacing` (what each pair's own scans resolve, so one set of weights serves a
             street and a table top) or `metre`, the paper's.
         stumps: decision stumps in each booster.
+        free_space: what beams see through and what hides from them, as extension weights of both chains (design finding 13).
+        decisions: what parts inliers from outliers and the nearest target point from others, as extension weights of both chains:
+            a gate on the residual, a constant, the lead of the nearest. This and `free_space` off: the paper's 30.
         left_out: features that the model does without, as `association.NAME` or `clustering.NAME` of a weight; a local channel is
-            then hidden from the boosters too.
+            then hidden from the boosters too. By default the two that compare an edge's length: where a surface is sampled sparsely
+            they call its points outliers.
     """
 
     raw_channels: bool = True
     wrap_closed: bool = True
     length_unit: str = "spacing"
     stumps: int = 50
-    left_out: tuple[str, ...] = ()
+    free_space: bool = True
+    decisions: bool = True
+    left_out: tuple[str, ...] = ("association.pairwise_distance", "association.pairwise_translation")
 
     def __post_init__(self) -> None:
         for name in self.left_out:

@@ -28,6 +28,19 @@ def match_movers(cluster: Ints, predicted: Ints) -> dict[int, int]:
     return {int(ids[i]): int(predicted_ids[j]) for i, j in zip(rows, columns, strict=True) if overlap[i, j] > 0}
 
 
+def relabel(predicted: Ints, cluster: Ints, matched: dict[int, int]) -> Ints:
+    """(N,) predicted labels in the numbers of the true ones; unmatched movers get numbers that no true one has."""
+    out = predicted.copy()
+    number = {theirs: ours for ours, theirs in matched.items()}
+    free = int(cluster.max(initial=0)) + 1
+    for mover in movers_in_order(predicted).tolist():
+        if mover not in number:
+            number[mover] = free
+            free += 1
+        out[predicted == mover] = number[mover]
+    return out
+
+
 def movers_in_order(labels: Ints) -> Ints:
     """(K,) movers that occur, in the order of their first point."""
     ids, first = np.unique(labels, return_index=True)

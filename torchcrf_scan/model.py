@@ -16,13 +16,15 @@ from torch import Tensor, nn
 from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.features.potentials import Boosters, PairView
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales, live_weights
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales, has_weight, live_weights
 from torchcrf_scan.inference import flooding, joint, lattice_likelihood, pseudo_likelihood
 from torchcrf_scan.inference.initialise import Start, initialise
 from torchcrf_scan.inference.joint import Parameters
 from torchcrf_scan.inference.movers import HypothesisScore
 from torchcrf_scan.inference.paper_start import paper_start
 from torchcrf_scan.inference.points_start import points_start
+from torchcrf_scan.inference.selection import ClusterPotential
+from torchcrf_scan.inference.uncertainty import Calibration
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 
 PRETRAINED = "simulated"
@@ -31,8 +33,9 @@ PRETRAINED = "simulated"
 class JointScanCRF(nn.Module):
     """Joint association, clustering and motion of B scan pairs.
 
-    Thirty named weights, 18 of the association chain and 12 of the clustering chain (spec 5.1); the boosters, the features'
-    scales and the score of the start's hypotheses are buffers, fitted before the weights (`torchcrf_scan.learning`).
+    Named weights: the paper's thirty, 18 of the association chain and 12 of the clustering chain (spec 5.1), and those of the
+    extensions that are on (`FeatureConfig`). The boosters, the features' scales and the score of the start's hypotheses are
+    buffers, fitted before the weights (`torchcrf_scan.learning`).
 
     Gradients reach the weights and the points through log-beliefs and, with `inference.motion_weights = soft`, through the motions,
     at fixed candidates and away from kinks (ties, capped errors). Without gradient: the labels, the start, the choice of
@@ -46,12 +49,19 @@ class JointScanCRF(nn.Module):
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__()
         self.config = config or ModelConfig()
-        self.association_weights = nn.ParameterDict([(name, nn.Parameter(torch.zeros(()))) for name in ASSOCIATION_WEIGHTS])
-        self.clustering_weights = nn.ParameterDict([(name, nn.Parameter(torch.zeros(()))) for name in CLUSTERING_WEIGHTS])
+        self.association_weights = self._zeros("association", ASSOCIATION_WEIGHTS)
+        self.clustering_weights = self._zeros("clustering", CLUSTERING_WEIGHTS)
         self.scales = Scales()
         self.boosters = Boosters(self.config.features.stumps)
         self.hypothesis_score = HypothesisScore()
+        self.calibration = Calibration()
+        self.cluster_potential = ClusterPotential()
         self.reset_parameters()
+
+    def _zeros(self, chain: str, names: Sequence[str]) -> nn.ParameterDict:
+        """A parameter for every weight that the model has."""
+        own = [name for name in names if has_weight(self.config.features, f"{chain}.{name}")]
+        return nn.ParameterDict([(name, nn.Parameter(torch.zeros(()))) for name in own])
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
@@ -72,16 +82,17 @@ class JointScanCRF(nn.Module):
 
     @property
     def weight_vectors(self) -> tuple[Tensor, Tensor]:
-        """(18,) and (12,): the weights in the order of `ASSOCIATION_WEIGHTS` and `CLUSTERING_WEIGHTS`, 0 for what is left out."""
-        association = torch.stack([self.association_weights[name] for name in ASSOCIATION_WEIGHTS])
-        clustering = torch.stack([self.clustering_weights[name] for name in CLUSTERING_WEIGHTS])
+        """(23,) and (20,): the weights in the order of `ASSOCIATION_WEIGHTS` and `CLUSTERING_WEIGHTS`, 0 for what is left out."""
+        none = torch.zeros_like(self.association_weights["sequence"])
+        association = torch.stack([self.association_weights.get(n, none) for n in ASSOCIATION_WEIGHTS])
+        clustering = torch.stack([self.clustering_weights.get(n, none) for n in CLUSTERING_WEIGHTS])
         live = live_weights(self.config.features)
         return association * live[0].to(association), clustering * live[1].to(clustering)
 
     @property
     def fitted(self) -> Parameters:
         """All that was learned, as the inference functions take it."""
-        return Parameters(*self.weight_vectors, self.scales, self.boosters)
+        return Parameters(*self.weight_vectors, self.scales, self.boosters, self.calibration, self.cluster_potential)
 
     def view(self, batch: ScanPairBatch) -> PairView:
         """What the features need of a batch, computed once."""
@@ -110,7 +121,8 @@ class JointScanCRF(nn.Module):
         view = self.view(batch)
         schedule = {"sweep": joint.decode, "flooding": flooding.decode}[self.config.inference.schedule]
         prediction = schedule(view, start.scaled(view.factor), self.fitted, self.config)
-        return replace(prediction, motions=scale_motions(prediction.motions, 1 / view.factor))
+        uncertainty = prediction.uncertainty and prediction.uncertainty.scaled(1 / view.factor)
+        return replace(prediction, motions=scale_motions(prediction.motions, 1 / view.factor), uncertainty=uncertainty)
 
     def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
         """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.

@@ -358,6 +358,62 @@ def test_wrong_prediction_is_refused_both_ways(tmp_path: Path, key: str, value: 
     assert not (tmp_path / "new.npz").exists()
 
 
+def certainty_arrays(clusters: int = 1) -> dict[str, Any]:
+    return {
+        "covariances": np.arange(9.0 * clusters).reshape(clusters, 3, 3),
+        "unobserved_turn": np.arange(clusters) % 2 == 1,
+        "unobserved_shift": np.linspace(-1, 1, 2 * clusters).reshape(clusters, 2),
+    }
+
+
+@pytest.mark.parametrize("clusters", [1, 3])
+def test_written_certainty_reads_back(tmp_path: Path, clusters: int) -> None:
+    arrays = prediction_arrays() | {"motions": np.zeros((clusters, 3)), "converged": False} | certainty_arrays(clusters)
+    prediction = PairPrediction(**arrays)
+    write_prediction(tmp_path / "pair.npz", prediction)
+    assert_same(read_prediction(tmp_path / "pair.npz"), prediction)
+
+
+def test_without_certainty_there_is_none_in_the_file(tmp_path: Path) -> None:
+    write_prediction(tmp_path / "pair.npz", PairPrediction(**prediction_arrays() | {"converged": True}))
+    with np.load(tmp_path / "pair.npz") as file:
+        assert not set(certainty_arrays()) & set(file)
+    found = read_prediction(tmp_path / "pair.npz")
+    assert (found.covariances, found.unobserved_turn, found.unobserved_shift) == (None, None, None)
+
+
+@pytest.mark.parametrize("key", list(certainty_arrays()))
+def test_certainty_is_whole_or_not_at_all(tmp_path: Path, key: str) -> None:
+    arrays = prediction_arrays() | certainty_arrays()
+    del arrays[key]
+    with pytest.raises(ValueError, match=f"pair.npz: {key}: expected this key"):
+        read_prediction(save(tmp_path, arrays))
+    with pytest.raises(ValueError, match=f"new.npz: {key}: expected this key"):
+        write_prediction(tmp_path / "new.npz", PairPrediction(**arrays))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("covariances", np.zeros((2, 3, 3)), r"shape \(1, 3, 3\), got \(2, 3, 3\)"),
+        ("covariances", np.zeros((1, 3)), r"shape \(1, 3, 3\), got \(1, 3\)"),
+        ("covariances", np.full((1, 3, 3), np.inf), "finite covariances, got inf"),
+        ("covariances", np.zeros((1, 3, 3), dtype=bool), "dtype float, got bool"),
+        ("unobserved_turn", np.zeros(2, dtype=bool), r"shape \(1\), got \(2,\)"),
+        ("unobserved_turn", np.zeros(1), "dtype bool, got float64"),
+        ("unobserved_shift", np.zeros(2), r"shape \(1, 2\), got \(2,\)"),
+        ("unobserved_shift", np.full((1, 2), np.nan), "finite directions, got nan"),
+    ],
+)
+def test_wrong_certainty_is_refused_both_ways(tmp_path: Path, key: str, value: Any, message: str) -> None:
+    arrays = prediction_arrays() | certainty_arrays() | {key: value}
+    with pytest.raises(ValueError, match=f"pair.npz: {key}: expected {message}"):
+        read_prediction(save(tmp_path, arrays))
+    with pytest.raises(ValueError, match=f"new.npz: {key}: expected {message}"):
+        write_prediction(tmp_path / "new.npz", PairPrediction(**arrays))
+    assert not (tmp_path / "new.npz").exists()
+
+
 def test_real_pairs_survive_reading_and_writing(real_pairs_dir: Path, tmp_path: Path) -> None:
     for path in sorted(real_pairs_dir.glob("*.npz")):
         pair = read_pair(path)

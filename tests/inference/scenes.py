@@ -1,6 +1,6 @@
 """Pairs of scans small enough to enumerate, and what must hold of any answer to them."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import torch
 from support import assert_close, generator, make_points, normal
@@ -71,6 +71,16 @@ def assert_same(found: Prediction, expected: Prediction, b: int, n: int) -> None
     assert_close(found.log_cluster[b, :n], expected.log_cluster[0])
     for name in ("active", "converged", "iterations"):
         assert torch.equal(getattr(found, name)[b], getattr(expected, name)[0]), name
+
+
+def assert_identical(found: Prediction, expected: Prediction) -> None:
+    """Every tensor is the same to the last bit."""
+    assert found.uncertainty is not None
+    assert expected.uncertainty is not None
+    for one, other in ((found, expected), (found.uncertainty, expected.uncertainty)):
+        for f in fields(one):
+            if f.name != "uncertainty":
+                assert torch.equal(getattr(one, f.name), getattr(other, f.name)), f.name
 
 
 def assert_sane(found: Prediction, batch: ScanPairBatch) -> None:

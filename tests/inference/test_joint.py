@@ -1,13 +1,13 @@
 """The sweep schedule on scenes small enough to enumerate: exact chains, batches, slots, scans with little in them."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import oracles
 import pytest
 import torch
-from scenes import CASES, MOTIONS, assert_same, assert_sane, make_batch, make_start, part_of, poor_scene, scene
-from support import assert_close, generator, make_points, normal
+from scenes import CASES, MOTIONS, assert_identical, assert_same, assert_sane, make_batch, make_start, part_of, poor_scene, scene
+from support import PAPER_ASSOCIATION, PAPER_CLUSTERING, assert_close, generator, make_points, normal, paper_weights
 from torch import Tensor
 
 from torchcrf_scan.batch import Prediction, ScanPairBatch
@@ -26,7 +26,7 @@ MODEL = JointScanCRF().double()
 
 
 def random_parameters(seed: int) -> Parameters:
-    return Parameters(normal(18, seed=seed), normal(12, seed=seed + 1), Scales().double(), Boosters(1).double())
+    return Parameters(*paper_weights(seed, seed + 1), Scales().double(), Boosters(1).double())
 
 
 def config(chains: str = "joint", **inference: object) -> ModelConfig:
@@ -56,7 +56,7 @@ def test_the_clustering_chain_equals_brute_force(seed: int, temperature: float) 
         config("clustering", clusters=4, iterations=1, temperature=temperature),
         parameters,
     )
-    scales, weights = parameters.scales, parameters.clustering.numpy()
+    scales, weights = parameters.scales, parameters.clustering[PAPER_CLUSTERING].numpy()
     arrays = source.numpy(), target.numpy(), MOTIONS.numpy()
     labels = association[0].tolist()
     local = oracles.local_clustering(
@@ -79,7 +79,7 @@ def test_the_association_chain_equals_brute_force(seed: int, temperature: float)
     batch, parameters = make_batch(source[None], target[None]), random_parameters(seed)
     settings = config("matching", candidates=0, iterations=1, temperature=temperature)
     found = decode(batch, make_start(batch, MOTIONS[:1]), settings, parameters)
-    scales, weights = parameters.scales, parameters.association.numpy()
+    scales, weights = parameters.scales, parameters.association[PAPER_ASSOCIATION].numpy()
     moved = se2.apply(MOTIONS[0], source).numpy()
     local = oracles.local_association(source.numpy(), target.numpy(), scales.local.tolist(), [0.0, 0.0, 0.0], moved)
     outlier = np.broadcast_to(scales.local_outlier.numpy(), (5, 1, 12))
@@ -91,6 +91,54 @@ def test_the_association_chain_equals_brute_force(seed: int, temperature: float)
     if temperature == 0:
         best = oracles.best_labelling(unary, pairwise @ weights[14:])
         assert tuple(found.association[0].tolist()) == tuple(-1 if j == 4 else j for j in best)
+
+
+def sharp_scales() -> Scales:
+    """Scales at which a point is neither as bad as any nor wholly inside the gate."""
+    scales = Scales().double()
+    scales.cluster_distance.fill_(1.5)
+    scales.gate.fill_(1.2)
+    return scales
+
+
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_clustering_chain_with_its_extensions_equals_brute_force(seed: int, temperature: float) -> None:
+    source, target = make_points(50, seed)[16:22], make_points(50, seed + 20)[18:23]  # dense, so that beams say something
+    batch, weights, scales = make_batch(source[None], target[None]), normal(20, seed=seed), sharp_scales()
+    association = torch.randint(-1, 5, (1, 6), generator=generator(seed))
+    settings = config("clustering", clusters=4, iterations=1, temperature=temperature)
+    parameters = Parameters(normal(23), weights, scales, Boosters(1).double())
+    found = decode(batch, make_start(batch, MOTIONS, association), settings, parameters)
+    arrays, labels = (source.numpy(), target.numpy(), MOTIONS.numpy()), association[0].tolist()
+    local = oracles.local_clustering(*arrays, [True] * 3, labels, 1.5, float(scales.outlier_threshold))
+    plain, possible = {name: value.tolist() for name, value in scales.named_buffers()}, np.ones((6, 3), dtype=bool)
+    every = oracles.lattice_extension(*arrays, possible, plain, float(batch.range_noise)).reshape(6, 6, 4, 13)
+    extension = np.array([every[i, j, :, 5:] for i, j in enumerate(labels)])  # -1 is the outlier, the last state
+    pairwise = oracles.pairwise_clustering(*arrays, labels, float(scales.neighbour_weight), float(scales.neighbour_distance))
+    unary = np.concatenate([local, extension], axis=-1) @ weights[:12].numpy()
+    assert_close(found.log_cluster[0], oracles.log_marginals(unary, pairwise @ weights[12:].numpy(), temperature))
+
+
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_association_chain_with_its_extensions_equals_brute_force(seed: int, temperature: float) -> None:
+    source, target = make_points(50, seed)[16:21], make_points(50, seed + 20)[18:22]
+    batch, weights, scales = make_batch(source[None], target[None]), normal(23, seed=seed), sharp_scales()
+    settings = config("matching", candidates=0, iterations=1, temperature=temperature)
+    parameters = Parameters(weights, normal(20), scales, Boosters(1).double())
+    found = decode(batch, make_start(batch, MOTIONS[:1]), settings, parameters)
+    moved = se2.apply(MOTIONS[0], source).numpy()
+    local = oracles.local_association(source.numpy(), target.numpy(), scales.local.tolist(), [0.0, 0.0, 0.0], moved)
+    outlier = np.broadcast_to(scales.local_outlier.numpy(), (5, 1, 12))
+    plain, possible = {name: value.tolist() for name, value in scales.named_buffers()}, np.ones((5, 1), dtype=bool)
+    arrays = source.numpy(), target.numpy(), MOTIONS[:1].numpy()
+    extension = oracles.lattice_extension(*arrays, possible, plain, float(batch.range_noise)).reshape(5, 5, 2, 13)[:, :, 0, :5]
+    unary = np.concatenate([local, outlier], axis=1) @ weights[:12].numpy() + extension @ weights[14:19].numpy()
+    pairwise = oracles.pairwise_association(
+        source.numpy(), target.numpy(), scales.pairwise.tolist(), scales.pairwise_outlier.tolist()
+    )
+    assert_close(found.log_association[0], oracles.log_marginals(unary, pairwise @ weights[19:].numpy(), temperature))
 
 
 def test_a_clean_scene_is_solved() -> None:
@@ -120,8 +168,7 @@ def test_all_candidates_are_the_dense_model() -> None:
     batch, _ = scene(16)
     start = make_start(batch, MOTIONS)
     dense, every = (decode(batch, start, config(clusters=4, candidates=count, temperature=1.0)) for count in (0, 16))
-    for f in fields(Prediction):
-        assert torch.equal(getattr(dense, f.name), getattr(every, f.name)), f.name
+    assert_identical(dense, every)
 
 
 def test_all_real_candidates_are_the_dense_model_in_a_padded_batch() -> None:

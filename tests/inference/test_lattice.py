@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scenes import (
     CASES,
     MOTIONS,
+    assert_identical,
     assert_same,
     assert_sane,
     make_batch,
@@ -21,14 +22,24 @@ from scenes import (
     random_stumps,
     scene,
 )
-from support import all_real, assert_close, generator, make_points, normal
+from support import PAPER_WEIGHTS, all_real, assert_close, extended, generator, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan.batch import Prediction, ScanPairBatch
 from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.features import clustering
 from torchcrf_scan.features.lattice import LatticeFeatures, LatticePotentials, lattice_features, transition_kinds
-from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, find_candidates, possible_clusters
+from torchcrf_scan.features.potentials import (
+    AssociationStates,
+    Boosters,
+    PairView,
+    association_unary,
+    clustering_unary,
+    find_candidates,
+    possible_clusters,
+    state_mask,
+)
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import joint
@@ -240,7 +251,7 @@ def test_the_potentials_of_a_toy_equal_the_loops_and_so_does_the_answer(seed: in
     reach = torch.rand(1, N, C, generator=generator(seed)) < 0.6
     reach[..., 0] = True
     possible = possible_clusters(torch.ones(1, C, dtype=torch.bool), reach, N)
-    found = features_of(batch, MOTIONS[:C], possible, scales, boosters).potentials(weights)
+    found = features_of(batch, MOTIONS[:C], possible, scales, boosters).potentials(extended(weights))
 
     plain: dict[str, Any] = {name: value.tolist() for name, value in scales.named_buffers()}
     arrays = source.numpy(), target.numpy(), MOTIONS[:C].numpy()
@@ -252,13 +263,74 @@ def test_the_potentials_of_a_toy_equal_the_loops_and_so_does_the_answer(seed: in
         assert_close(torch.from_numpy(ours), theirs, tolerance=1e-6)  # tables of stumps are summed in float32
 
     if M == 2:  # nine states a node: 6561 labellings
-        parameters = Parameters(weights[:18], weights[18:], scales, boosters)
+        parameters = Parameters(extended(weights[:18]), extended(weights[18:]), scales, boosters)
         start = replace(make_start(batch, MOTIONS[:C]), reach=reach)
         answer = decode(batch, start, config(clusters=C + 1, candidates=0, iterations=1), parameters)
         best = np.array(oracles.best_labelling(unary, pairwise))
         j, k = best // (C + 1), best % (C + 1)
         assert answer.association[0].tolist() == np.where(j == M, -1, j).tolist()
         assert answer.cluster[0].tolist() == np.where(k == C, -1, k).tolist()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_with_extensions_they_equal_the_loops_too_and_so_does_the_answer(seed: int) -> None:
+    N, M, C = 4, 2 + seed % 2 * 3, 2
+    source, target = make_points(50, seed)[16 : 16 + N], make_points(50, seed + 20)[18 : 18 + M]  # dense: beams say something
+    batch = make_batch(source[None], target[None])
+    scales, boosters, weights = loose_scales(), Boosters(1).double(), normal(43, seed=seed)
+    scales.gate.fill_(1.2)
+    reach = torch.rand(1, N, C, generator=generator(seed)) < 0.6
+    reach[..., 0] = True
+    possible = possible_clusters(torch.ones(1, C, dtype=torch.bool), reach, N)
+    found = features_of(batch, MOTIONS[:C], possible, scales, boosters).potentials(weights)
+
+    plain: dict[str, Any] = {name: value.tolist() for name, value in scales.named_buffers()}
+    arrays = source.numpy(), target.numpy(), MOTIONS[:C].numpy()
+    nothing = [], [], [], []
+    local = oracles.lattice_local(*arrays, reach[0].numpy(), plain, [0.0, 0.0, 0.0], nothing, nothing)
+    extension = oracles.lattice_extension(*arrays, reach[0].numpy(), plain, float(batch.range_noise))
+    assert (extension != 0).any((0, 1)).sum() >= 9
+    paper, others = weights[PAPER_WEIGHTS].numpy(), weights[[k for k in range(43) if k not in PAPER_WEIGHTS]].numpy()
+    unary = local @ paper + extension @ others
+    unary.reshape(N, M + 1, C + 1)[:, :, :C][~reach[0].numpy()[:, None].repeat(M + 1, 1)] = -np.inf
+    pairwise = oracles.lattice_pairwise(*arrays, plain) @ paper
+    for ours, theirs in zip(tables(found), (unary, pairwise), strict=True):
+        assert_close(torch.from_numpy(ours), theirs)
+
+    if M == 2:
+        start = replace(make_start(batch, MOTIONS[:C]), reach=reach)
+        parameters = Parameters(*weights.split([23, 20]), scales, boosters)
+        answer = decode(batch, start, config(clusters=C + 1, candidates=0, iterations=1), parameters)
+        j, k = np.divmod(np.array(oracles.best_labelling(unary, pairwise)), C + 1)
+        assert answer.association[0].tolist() == np.where(j == M, -1, j).tolist()
+        assert answer.cluster[0].tolist() == np.where(k == C, -1, k).tolist()
+
+
+@pytest.mark.parametrize("search", ["motion", "position"])
+@pytest.mark.parametrize("candidates", [0, 3, 6])
+def test_a_super_node_has_the_extensions_of_both_chains_given_the_others_state(candidates: int, search: str) -> None:
+    N, M, C = 30, 26, 3
+    source, target = make_points(N, 1), make_points(M, 21)
+    batch = make_batch(source.expand(2, N, 2), target.expand(2, M, 2), ([N, N], [M, 4]))  # the second has few candidates
+    view, scales, boosters = PairView.of(batch), loose_scales(), Boosters(1).double()
+    motions, active = MOTIONS.expand(2, -1, -1), torch.ones(2, C, dtype=torch.bool)
+    found = find_candidates(view, motions, active, InferenceConfig(candidates=candidates, candidate_search=search))
+    states = AssociationStates.of(view, found.index, found.mask, scales, boosters)
+    possible = torch.ones(2, N, C + 1, dtype=torch.bool)
+    moving = lattice_features(view, states, motions, found.nearest, possible, scales, boosters).moving
+    real = state_mask(found.mask)
+    for k in range(C):
+        moved = se2.apply(motions[:, k], batch.source)
+        expected = association_unary(view, states, moved, scales, boosters)[..., 14:]
+        assert_close(moving[..., k, 2:7][real], expected[real])
+    K = found.index.shape[-1]
+    for j in range(K + 1):
+        association = found.index[..., j] if j < K else torch.full((2, N), -1)
+        at = clustering.correspond(batch.source, batch.target, motions, found.nearest, association)
+        expected = clustering_unary(view, at, motions, active, scales)[..., 4:]
+        assert_close(moving[:, :, j, :, 11:][real[..., j]], expected[real[..., j]])
+    assert moving.shape[-1] == 19
+    assert (moving[real][..., 2:7] != 0).flatten(0, -2).any(0).all()
 
 
 def test_no_motion_but_the_own_one_matters_to_an_inlier() -> None:
@@ -278,7 +350,7 @@ def test_features_are_differentiable() -> None:
 
     def potentials(source: Tensor, motions: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         made = features_of(replace(batch, source=source), motions, possible, loose_scales(), Boosters(1).double(), 2)
-        found = made.potentials(weights)
+        found = made.potentials(extended(weights))
         return found.log_unary, found.log_association, found.log_cluster
 
     inputs = [value.clone().requires_grad_() for value in (batch.source, MOTIONS, normal(30))]
@@ -367,8 +439,7 @@ def test_every_pair_is_decoded_as_if_alone() -> None:
 def test_all_candidates_are_the_dense_model() -> None:
     batch, _ = scene(16)
     dense, every = (decode(batch, make_start(batch, MOTIONS), config(clusters=4, candidates=count)) for count in (0, 16))
-    for f in fields(Prediction):
-        assert torch.equal(getattr(dense, f.name), getattr(every, f.name)), f.name
+    assert_identical(dense, every)
 
 
 def test_gradients_reach_all_weights_that_a_scene_can_teach() -> None:

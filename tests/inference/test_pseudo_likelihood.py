@@ -8,7 +8,7 @@ import oracles
 import pytest
 import torch
 from scenes import random_stumps
-from support import assert_close, make_points, normal
+from support import assert_close, extended, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
@@ -16,7 +16,7 @@ from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.features.candidates import with_targets
 from torchcrf_scan.features.potentials import Boosters, PairView
-from torchcrf_scan.features.scales import Scales
+from torchcrf_scan.features.scales import CLUSTERING_UNARY, Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.joint import Parameters
 from torchcrf_scan.inference.pseudo_likelihood import (
@@ -120,7 +120,7 @@ def test_the_association_conditionals_equal_the_loops(seed: int) -> None:
     labels = [j if j >= 0 else M for j in ASSOCIATION[0].tolist()]
     weights = normal(18, seed=seed)
     expected = conditionals(unary, pairwise, labels, weights.numpy())
-    assert_close(design.log_likelihood(weights)[0], expected, tolerance=1e-6)  # tables of stumps are summed in float32
+    assert_close(design.log_likelihood(extended(weights))[0], expected, tolerance=1e-6)  # tables of stumps are summed in float32
     assert design.label[0].tolist() == labels
 
 
@@ -137,14 +137,14 @@ def test_the_clustering_conditionals_equal_the_loops(seed: int) -> None:
     pairwise = oracles.pairwise_clustering(*arrays, plugged, float(scales.neighbour_weight), float(scales.neighbour_distance))
     labels = [k if k >= 0 else C for k in CLUSTER[0].tolist()]
     weights = normal(12, seed=seed)
-    assert_close(design.log_likelihood(weights)[0], conditionals(local, pairwise, labels, weights.numpy()))
+    assert_close(design.log_likelihood(extended(weights))[0], conditionals(local, pairwise, labels, weights.numpy()))
 
 
 def test_inactive_slots_are_no_alternative() -> None:
     batch = tiny()
     plugins = true_plugins(batch, 4)
     assert plugins.active.tolist() == [[True, True, False, False]]
-    weights = normal(12)
+    weights = normal(20)
     wide = clustering_design(PairView.of(batch), plugins, Scales().double()).log_likelihood(weights)
     narrow = clustering_design(PairView.of(batch), true_plugins(batch, 2), Scales().double()).log_likelihood(weights)
     assert_close(wide, narrow)
@@ -152,7 +152,7 @@ def test_inactive_slots_are_no_alternative() -> None:
 
 def test_the_joint_is_the_sum_of_both_chains() -> None:
     batch, scales, boosters = tiny(), Scales().double(), Boosters(1).double()
-    parameters = Parameters(normal(18), normal(12, seed=1), scales, boosters)
+    parameters = Parameters(normal(23), normal(20, seed=1), scales, boosters)
     view, plugins = PairView.of(batch), plugins_of(batch)
     first = association_design(view, plugins, scales, boosters, InferenceConfig()).log_likelihood(parameters.association).sum(-1)
     second = clustering_design(view, plugins, scales).log_likelihood(parameters.clustering).sum(-1)
@@ -177,7 +177,7 @@ def test_the_gradient_equals_central_differences(pairs: ScanPairBatch) -> None:
     names, weights = zip(*model.named_parameters(), strict=True)
     slopes = torch.autograd.grad(value, weights)
     step = 1e-4
-    assert len(names) == 30
+    assert len(names) == 43
     for name, weight, slope in zip(names, weights, slopes, strict=True):
         sides = []
         for sign in (1, -1):
@@ -233,12 +233,12 @@ def test_unknown_nodes_say_nothing_and_do_not_count(node: int) -> None:
     one = annotated(tiny(), known=known)
     other = annotated(tiny(), known=known, association=other_association, cluster=other_cluster)
     first, second = designs(one)[0], designs(other)[0]
-    weights = normal(18)
+    weights = normal(23)
     assert float(first.log_likelihood(weights)[0, node]) == 0
     assert_close(second.log_likelihood(weights), first.log_likelihood(weights))
     clustering = designs(one)[1]
-    assert float(clustering.log_likelihood(normal(12))[0, node]) == 0
-    edges = slice(4, None)
+    assert float(clustering.log_likelihood(normal(20))[0, node]) == 0
+    edges = slice(CLUSTERING_UNARY, None)
     full = designs(tiny())[1].features[0, :, :, edges]
     for neighbour in {node - 1, node + 1} & set(range(N)):
         assert not torch.equal(clustering.features[0, neighbour, :, edges], full[neighbour])
@@ -278,7 +278,7 @@ def test_padding_does_not_count() -> None:
             torch.arange(N + 3)[None] < N,
         ),
     )
-    for one, other, width in zip(designs(batch), designs(padded), (18, 12), strict=True):
+    for one, other, width in zip(designs(batch), designs(padded), (23, 20), strict=True):
         assert_close(other.log_likelihood(normal(width))[:, :N], one.log_likelihood(normal(width)))
         assert (other.log_likelihood(normal(width))[:, N:] == 0).all()
 

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from support import PAPER_ASSOCIATION, PAPER_CLUSTERING
 
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, LearningConfig, ModelConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, FREE_SPACE_WEIGHTS, LOCAL_CHANNELS
 from torchcrf_scan.inference.movers import HypothesisScore
 from torchcrf_scan.inference.pseudo_likelihood import pseudo_log_likelihood
 from torchcrf_scan.learning.fit import fit, fit_all_boosters, prepare, set_weights
@@ -120,12 +121,19 @@ def test_the_literal_reading_learns_no_raw_weight(material: list[Material]) -> N
 
 def test_set_weights_follows_the_names() -> None:
     model = JointScanCRF()
-    set_weights(model, "association", torch.arange(18.0))
-    set_weights(model, "clustering", torch.arange(12.0))
-    assert [model.association_weights[name].item() for name in ASSOCIATION_WEIGHTS] == list(range(18))
-    assert [model.clustering_weights[name].item() for name in CLUSTERING_WEIGHTS] == list(range(12))
+    set_weights(model, "association", torch.arange(23.0))
+    set_weights(model, "clustering", torch.arange(20.0))
+    assert [model.association_weights[name].item() for name in ASSOCIATION_WEIGHTS] == list(range(23))
+    assert [model.clustering_weights[name].item() for name in CLUSTERING_WEIGHTS] == list(range(20))
     with pytest.raises(ValueError, match="zip"):
-        set_weights(model, "clustering", torch.arange(18.0))
+        set_weights(model, "clustering", torch.arange(23.0))
+
+
+def test_set_weights_passes_over_what_the_model_does_not_have() -> None:
+    model = JointScanCRF(ModelConfig(features=FeatureConfig(free_space=False, decisions=False, left_out=())))
+    set_weights(model, "association", torch.arange(23.0))
+    set_weights(model, "clustering", torch.arange(20.0))
+    assert [weight.item() for weight in model.parameters()] == [*PAPER_ASSOCIATION, *PAPER_CLUSTERING]
 
 
 @pytest.mark.parametrize("layer", [MatchingCRF, ClusteringCRF])
@@ -137,12 +145,12 @@ def test_what_is_left_out_is_not_learned(layer: type[JointScanCRF], material: li
         "clustering.outlier",
         "clustering.sequence",
     )
-    model = layer(replace(MODEL, features=FeatureConfig(stumps=10, left_out=left_out)))
+    model = layer(replace(MODEL, features=FeatureConfig(stumps=10, free_space=False, left_out=left_out)))
     fit(model, material[:2], LEARNING)
     chain, names = ("association", ASSOCIATION_WEIGHTS) if layer is MatchingCRF else ("clustering", CLUSTERING_WEIGHTS)
     learned = dict(zip(names, model.weight_vectors[chain == "clustering"].tolist(), strict=True))
     assert {f"{chain}.{name}" for name, value in learned.items() if value == 0} == {
-        name for name in left_out if name.startswith(chain)
+        name for name in (*left_out, *FREE_SPACE_WEIGHTS) if name.startswith(chain)
     }
     inputs = -9 * torch.rand(100, len(LOCAL_CHANNELS))
     changed = inputs.clone()

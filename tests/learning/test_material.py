@@ -64,6 +64,7 @@ def test_pairs_are_disturbed_a_little_and_keep_their_names(small_pairs: list[Sca
         tuple(pair.name for pair in small_pairs),
         tuple(pair.sequence for pair in small_pairs),
     )
+    assert collection.pairs == tuple(small_pairs)
     as_they_are = ScanPairBatch.collate(small_pairs)
     moved = torch.linalg.vector_norm(collection.batch.source - as_they_are.source, dim=-1)[as_they_are.source_mask]
     assert 0 < float(moved.median()) < 0.5
@@ -99,6 +100,7 @@ def test_material_is_the_chosen_pairs_with_the_start_of_the_score(small_pairs: l
     seen = sorted(round(float(part.batch.source[b].sum()), 3) for part in material for b in range(len(part.batch)))
     assert seen == sorted(round(float(ScanPairBatch.collate([pairs[k]]).source.sum()), 3) for k in (2, 0))
     for part in material:
+        assert torch.equal(ScanPairBatch.collate(part.pairs).source, part.batch.source)
         expected = initialise(part.batch, score, 4)
         assert part.start.motions.shape == (len(part.batch), 4, 3)
         assert torch.equal(part.start.active, expected.active)

@@ -1,5 +1,6 @@
 """Everything that is compared: every row answers, and only the rows that say so have seen the truth."""
 
+import copy
 import itertools
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -11,6 +12,7 @@ import torch
 from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
 from torchcrf_scan.config import Config
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.methods import (
     EXACT,
     JOINT,
@@ -25,9 +27,11 @@ from torchcrf_scan.learning.methods import (
     with_config,
     with_motions_given,
 )
+from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 ORACLES = ("joint, true motions", "joint, true associations")
+OWN = ("association_weights", "clustering_weights", "cluster_potential", "calibration")  # of every joint model
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +111,8 @@ def test_the_joint_model_alone_is_the_same_model(
     assert list(alone.joint) == [JOINT]
     assert alone.cascade is None
     for name, value in models.joint[JOINT].state_dict().items():
-        assert torch.equal(alone.joint[JOINT].state_dict()[name], value), name
+        expected = JointScanCRF().state_dict()[name] if name.startswith("calibration.") else value
+        assert torch.equal(alone.joint[JOINT].state_dict()[name], expected), name
     assert list(answer(alone, small_pairs[5])) == [JOINT]
 
 
@@ -116,9 +121,19 @@ def test_the_joint_models_share_their_features(models: Models) -> None:
     states = [model.state_dict() for model in models.joint.values()]
     for name, value in states[0].items():
         same = [torch.equal(state[name], value) for state in states[1:]]
-        assert all(same) or name.split(".")[0] in ("association_weights", "clustering_weights"), name
+        assert all(same) or name.split(".")[0] in OWN, name
     weights = [torch.cat(model.weight_vectors).detach() for model in models.joint.values()]
     assert all(not torch.equal(one, other) for one, other in itertools.combinations(weights, 2))
+
+
+def test_every_joint_model_is_calibrated_on_what_it_was_fitted_on(study: Study, models: Models, small_config: Config) -> None:
+    """The fold's own pairs alone: a second calibration on them changes nothing."""
+    for name, model in models.joint.items():
+        again = copy.deepcopy(model)
+        calibrate(again, study.collection.material(range(4), model.hypothesis_score, 4, small_config.learning))
+        assert torch.equal(again.calibration.association, model.calibration.association), name
+        assert torch.equal(again.calibration.cluster, model.calibration.cluster), name
+        assert not torch.equal(model.calibration.association, JointScanCRF().calibration.association), name
 
 
 def joint_rows(answers: dict[str, Answer]) -> Sequence[str]:

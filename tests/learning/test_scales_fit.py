@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from support import assert_close, make_points, normal
 from torch import Tensor
 
@@ -13,7 +15,7 @@ from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.pseudo_likelihood import PlugIns, true_plugins
-from torchcrf_scan.learning.scales_fit import CLUSTER_FLOOR, FLOOR, fit_scales, own_motion, robust_scale, true_errors
+from torchcrf_scan.learning.scales_fit import CLUSTER_FLOOR, FLOOR, fit_gate, fit_scales, own_motion, robust_scale, true_errors
 
 N = 40
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3]], dtype=torch.float64)
@@ -79,6 +81,35 @@ def test_scales_are_medians_of_the_true_errors() -> None:
     for (name, place), value in expected.items():
         found = getattr(scales, name) if place is None else getattr(scales, name)[place]
         assert_close(found, value)
+
+
+def errors_of(gate: float, matched: list[float], unmatched: list[float]) -> int:
+    """True pairs that a gate keeps out, and outliers that it lets in."""
+    return sum(d > gate for d in matched) + sum(d <= gate for d in unmatched)
+
+
+DISTANCES = st.lists(st.integers(0, 12).map(lambda k: k / 8), max_size=8)  # many of them alike
+
+
+@given(DISTANCES, DISTANCES)
+def test_no_gate_makes_fewer_errors(matched: list[float], unmatched: list[float]) -> None:
+    found = float(fit_gate(*(torch.tensor(values, dtype=torch.float64) for values in (matched, unmatched))))
+    assert found >= CLUSTER_FLOOR
+    least = min(errors_of(gate, matched, unmatched) for gate in (CLUSTER_FLOOR, *matched, *unmatched) if gate >= CLUSTER_FLOOR)
+    assert errors_of(found, matched, unmatched) == least
+
+
+def test_the_gate_is_between_true_pairs_and_outliers() -> None:
+    view, plugins = annotated(0.02)
+    far = view.batch.target.clone()
+    far[0, -5:] += 50.0  # the outliers' former partners are gone
+    view = PairView.of(replace(view.batch, target=far))
+    errors = true_errors(view, plugins)
+    assert len(errors["unmatched"]) == 5
+    assert float(fit_scales([view], [plugins]).gate) == pytest.approx(max(float(errors["cluster"].max()), CLUSTER_FLOOR))
+    moved = own_motion(plugins, view.batch.source)[0, -5:]
+    nearest = torch.cdist(moved, view.batch.target[0]).amin(-1)
+    assert_close(errors["unmatched"], nearest, tolerance=1e-6)
 
 
 def test_shape_scales_are_medians_over_both_sides() -> None:

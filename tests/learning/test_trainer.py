@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchcrf_scan.config import DataConfig
@@ -67,6 +68,17 @@ def test_the_model_can_be_loaded(run: Path) -> None:
     model = JointScanCRF.from_pretrained(run / "model")
     assert model.config.features.stumps == 15
     assert float(model.boosters.data.table.abs().max()) > 0
+    assert not torch.equal(model.calibration.association, JointScanCRF().calibration.association)
+
+
+def test_metrics_and_tables_tell_how_sure_the_answers_are(run: Path) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    for method in METHODS:
+        assert 0 <= metrics[method]["association_ece"] <= 100
+        assert 0 <= metrics[method]["cluster_ece"] <= 100
+    assert metrics["joint"]["nees_pairs"] == 6
+    assert metrics["joint"]["nees_mean"] > 0
+    assert "**How sure**" in (run / "tables.md").read_text()
 
 
 def test_the_config_is_the_resolved_one(run: Path) -> None:

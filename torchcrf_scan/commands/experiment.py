@@ -66,7 +66,7 @@ def read_variants(folder: Path, config: Config) -> dict[str, Config]:
         if not left_out:
             variants[file.stem] = variant
         for name in left_out:
-            features = replace(variant.model.features, left_out=(name,))
+            features = replace(variant.model.features, left_out=(*variant.model.features.left_out, name))
             variants[f"without {name}"] = replace(variant, model=replace(variant.model, features=features))
     return variants
 
