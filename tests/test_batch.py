@@ -324,3 +324,12 @@ def test_a_prediction_of_an_empty_scan() -> None:
     assert answer.association.tolist() == answer.cluster.tolist() == [-1, -1, -1]
     assert answer.association_confidence.tolist() == [0.0, 0.0, 0.0]
     assert len(answer.motions) == 1
+
+
+def test_a_guess_of_the_motion_comes_along() -> None:
+    scan = Scan.from_ranges(np.full(5, 2.0), np.linspace(-1.0, 1.0, 5))
+    pairs = [ScanPair(scan, scan), ScanPair(scan, scan, initial_motion=np.array([0.1, 1.0, -2.0]))]
+    assert_close(ScanPairBatch.collate(pairs, torch.float64).initial_motion, [[0.0, 0.0, 0.0], [0.1, 1.0, -2.0]])
+    for wrong in (np.zeros(2), np.array([0.0, np.nan, 0.0])):
+        with pytest.raises(ValueError, match="initial_motion: expected three finite numbers"):
+            ScanPairBatch.collate([ScanPair(scan, scan, initial_motion=wrong)])

@@ -115,6 +115,15 @@ def test_no_two_ablations_are_the_same(variants: dict[str, Config]) -> None:
     assert len({str(config) for config in variants.values()}) == len(variants) > 40
 
 
+@pytest.mark.parametrize("path", sorted((CONFIGS / "ablations_default").glob("*.yaml")), ids=lambda path: path.stem)
+def test_an_ablation_of_the_default_changes_it(path: Path) -> None:
+    assert path.read_text().startswith("# ")
+    default = load("simulated.yaml")
+    variant = read_variants(path.parent, default)[path.stem]
+    assert variant != default
+    assert (variant.data, variant.output) == (default.data, default.output)
+
+
 def test_every_feature_is_left_out_in_turn(variants: dict[str, Config]) -> None:
     paper = load("paper.yaml")
     without = {name.removeprefix("without "): config for name, config in variants.items() if name.startswith("without ")}

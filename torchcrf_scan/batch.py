@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
+from torchcrf_scan.scan import Floats, PairPrediction, Scan, ScanPair
 
 if TYPE_CHECKING:
     from torchcrf_scan.inference.uncertainty import Uncertainty
@@ -150,7 +150,7 @@ class ScanPairBatch:
             target_closed=torch.tensor([pair.target.is_closed for pair in pairs]),
             dt=torch.tensor([pair.dt for pair in pairs], dtype=dtype),
             range_noise=torch.tensor([_range_noise(pair) for pair in pairs], dtype=dtype),
-            initial_motion=torch.zeros(len(pairs), 3, dtype=dtype),
+            initial_motion=torch.from_numpy(np.stack([_initial_motion(pair) for pair in pairs])).to(dtype),
             target_origin=torch.zeros(len(pairs), 2, dtype=dtype),
             truth=_collate_truth(pairs, source_mask, dtype) if all(pair.annotation for pair in pairs) else None,
         )
@@ -170,6 +170,16 @@ def _pad_points(scans: Sequence[Scan]) -> tuple[Tensor, Tensor]:
     for row, scan in zip(points, scans, strict=True):
         row[: len(scan)] = torch.from_numpy(scan.points)
     return points, torch.arange(longest) < lengths[:, None]
+
+
+def _initial_motion(pair: ScanPair) -> Floats:
+    """(3,) the guess, the identity where there is none."""
+    if pair.initial_motion is None:
+        return np.zeros(3)
+    guess = np.asarray(pair.initial_motion, dtype=np.float64)
+    if guess.shape != (3,) or not np.isfinite(guess).all():
+        raise ValueError(f"initial_motion: expected three finite numbers (theta, tx, ty), got {pair.initial_motion!r}")
+    return guess
 
 
 def _range_noise(pair: ScanPair) -> float:

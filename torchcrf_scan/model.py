@@ -10,6 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -39,7 +40,7 @@ class JointScanCRF(nn.Module):
 
     Gradients reach the weights and the points through log-beliefs and, with `inference.motion_weights = soft`, through the motions,
     at fixed candidates and away from kinks (ties, capped errors). Without gradient: the labels, the start, the choice of
-    candidates, the unit of length, and the boosted scores, which are steps. The `flooding` schedule has no gradient at all and fits
+    candidates, the unit of length, what beams measured, and the boosted scores, which are steps. The `flooding` schedule has no gradient at all and fits
     its motions by Eq. 6 on hard labels whatever `motion_metric` and `motion_weights` say.
     """
 
@@ -140,9 +141,15 @@ class JointScanCRF(nn.Module):
         return pseudo_likelihood.pseudo_log_likelihood(view, plugins, self.fitted, self.config)
 
     @torch.no_grad()
-    def match(self, source: Scan, target: Scan, dt: float = 0.1) -> PairPrediction:
-        """One pair, by beam: what became of every beam of `source`, which move together, and how."""
-        pair = ScanPair(source, target, dt)
+    def match(
+        self, source: Scan, target: Scan, dt: float = 0.1, *, initial_motion: Sequence[float] | None = None
+    ) -> PairPrediction:
+        """One pair, by beam: what became of every beam of `source`, which move together, and how.
+
+        initial_motion: a guess (theta, tx, ty) of the background's motion, e.g. from odometry; one more start, never
+                trusted blindly.
+        """
+        pair = ScanPair(source, target, dt, initial_motion=None if initial_motion is None else np.asarray(initial_motion))
         return self.match_pairs([pair])[0]
 
     @torch.no_grad()

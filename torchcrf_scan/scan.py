@@ -137,7 +137,8 @@ class ScanPair:
     """Two consecutive scans `dt` seconds apart, with or without annotation.
 
     `sequence` names the recording (pairs of one sequence overlap in time: never split one between training and test), `name`
-    the pair, `origin` where the data comes from.
+    the pair, `origin` where the data comes from. `initial_motion` (3,) is a guess of the background's `T_target_source`, from
+    odometry or the motion before; None: there is none.
     """
 
     source: Scan
@@ -147,6 +148,7 @@ class ScanPair:
     sequence: str = ""
     name: str = ""
     origin: str = ""
+    initial_motion: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ NOWHERE = torch.zeros(1, 2).double()
 def sweep(points: Tensor, *, closed: bool = False, noise: float = 0.01, origin: Tensor = NOWHERE[0], extra: int = 0) -> Sweep:
     """One scan (N, 2), with some padding behind it."""
     padded, mask = pad(points[None], extra)
-    return Sweep.of(padded, mask, torch.tensor([closed]), torch.tensor([noise]).double(), origin[None])
+    return Sweep.of(padded, mask, torch.tensor([closed]), torch.tensor([noise], dtype=torch.float64), origin[None])
 
 
 def make_scan(n: int, turn: float, seed: int, *, closed: bool = False) -> tuple[Tensor, Tensor]:
@@ -110,7 +110,7 @@ def test_a_batch_is_its_scans_and_padding_is_invisible(lengths: list[int], seed:
     points, origins = (torch.stack(of) for of in zip(*(make_scan(N, b, seed + b) for b in range(B)), strict=True))
     mask = torch.arange(N) < torch.tensor(lengths)[:, None]
     asked = 14 * torch.rand(B, 5, 2, 2, generator=generator(seed), dtype=torch.float64) - 7
-    rest = torch.zeros(B, dtype=torch.bool), torch.full((B,), 0.01).double(), origins
+    rest = torch.zeros(B, dtype=torch.bool), torch.full((B,), 0.01, dtype=torch.float64), origins
     together = look(Sweep.of(points, mask, *rest), asked)
     other = look(Sweep.of(torch.where(mask[..., None], points, 77.0), mask, *rest), asked)
     for b, n in enumerate(lengths):
@@ -176,7 +176,7 @@ def test_it_says_yes_where_the_flags_of_the_start_do(scan: tuple[int, bool, floa
     points, origin = make_scan(n, turn, seed, closed=closed)
     asked = queries(points, origin, seed)
     found = look(sweep(points, closed=closed, noise=noise, origin=origin), asked[None])
-    flags = look_along(asked, Surface.of(points, torch.tensor(noise).double(), closed, origin))
+    flags = look_along(asked, Surface.of(points, torch.tensor(noise, dtype=torch.float64), closed, origin))
     assert torch.equal(found.seen_through[0] > 0, flags.seen_through)
     assert torch.equal(found.hidden[0] > 0, flags.occluded)
 

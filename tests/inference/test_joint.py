@@ -107,7 +107,7 @@ def test_the_clustering_chain_with_its_extensions_equals_brute_force(seed: int, 
     source, target = make_points(50, seed)[16:22], make_points(50, seed + 20)[18:23]  # dense, so that beams say something
     batch, weights, scales = make_batch(source[None], target[None]), normal(20, seed=seed), sharp_scales()
     association = torch.randint(-1, 5, (1, 6), generator=generator(seed))
-    settings = config("clustering", clusters=4, iterations=1, temperature=temperature)
+    settings = config("clustering", clusters=4, iterations=1, temperature=temperature, motion_metric="given")
     parameters = Parameters(normal(23), weights, scales, Boosters(1).double())
     found = decode(batch, make_start(batch, MOTIONS, association), settings, parameters)
     arrays, labels = (source.numpy(), target.numpy(), MOTIONS.numpy()), association[0].tolist()
@@ -125,7 +125,7 @@ def test_the_clustering_chain_with_its_extensions_equals_brute_force(seed: int, 
 def test_the_association_chain_with_its_extensions_equals_brute_force(seed: int, temperature: float) -> None:
     source, target = make_points(50, seed)[16:21], make_points(50, seed + 20)[18:22]
     batch, weights, scales = make_batch(source[None], target[None]), normal(23, seed=seed), sharp_scales()
-    settings = config("matching", candidates=0, iterations=1, temperature=temperature)
+    settings = config("matching", candidates=0, iterations=1, temperature=temperature, motion_metric="given")
     parameters = Parameters(weights, normal(20), scales, Boosters(1).double())
     found = decode(batch, make_start(batch, MOTIONS[:1]), settings, parameters)
     moved = se2.apply(MOTIONS[0], source).numpy()

@@ -19,7 +19,7 @@ from torchcrf_scan.scan import ScanPair
 
 Item = TypeVar("Item")
 
-BATCH = 4  # pairs that are matched at once: more are hardly faster, but the progress bar moves less often
+BATCH = 16  # pairs that are matched at once
 
 
 def load_model(name: str, candidates: int | None = None, device: str = "cpu", threads: int | None = None) -> JointScanCRF:

@@ -370,6 +370,6 @@ def simulate_pairs(config: SimulatorConfig, pairs: int, sequences: int, seed: in
         captures = _simulate_sequence(config, length, np.random.default_rng([seed, s]))
         for index, (source, target) in enumerate(pairwise(captures)):
             annotation = annotate(source, target, config)
-            names = {"sequence": f"sim{seed}_{s}", "name": f"sim_s{s}_{index:03d}", "origin": ORIGIN}
-            simulated.append(ScanPair(source.scan, target.scan, config.dt, annotation, **names))
+            scans = source.scan, target.scan, config.dt, annotation
+            simulated.append(ScanPair(*scans, sequence=f"sim{seed}_{s}", name=f"sim_s{s}_{index:03d}", origin=ORIGIN))
     return simulated

@@ -62,6 +62,8 @@ def discard_vacuous(view: PairView, start: Start, state: State, parameters: Para
     """The state without the clusters that are worth less than nothing. Movers only; needs `start.log_odds`."""
     assert start.log_odds is not None
     for _ in range(state.motions.active.shape[1] - 1):
+        if not bool(state.motions.active[:, 1:].any()):
+            break
         worth = parameters.potential(evidence(view, start, state, parameters, config), start.log_odds)  # (B, C)
         is_mover = torch.arange(worth.shape[1], device=worth.device) > 0
         least, which = worth.masked_fill(~(state.motions.active & is_mover), torch.inf).min(-1)
