@@ -40,8 +40,8 @@ class JointScanCRF(nn.Module):
 
     Gradients reach the weights and the points through log-beliefs and, with `inference.motion_weights = soft`, through the motions,
     at fixed candidates and away from kinks (ties, capped errors). Without gradient: the labels, the start, the choice of
-    candidates, the unit of length, what beams measured, and the boosted scores, which are steps. The `flooding` schedule has no gradient at all and fits
-    its motions by Eq. 6 on hard labels whatever `motion_metric` and `motion_weights` say.
+    candidates, the unit of length, what beams measured, and the boosted scores, which are steps. The `flooding` schedule has no
+    gradient at all and fits its motions by Eq. 6 on hard labels whatever `motion_metric` and `motion_weights` say.
     """
 
     association_weights: nn.ParameterDict
