@@ -1,6 +1,7 @@
 """Slopes, offsets and factors that are known come back; a model's own answers are judged as the metrics judge them."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,16 @@ from torchcrf_scan.config import Config
 from torchcrf_scan.evaluation.calibration import consistency, expected_calibration_error
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.inference.uncertainty import Calibration
-from torchcrf_scan.learning.calibration_fit import Judged, calibrate, fit_calibration, fit_confidence, fit_covariance_factor, judge
+from torchcrf_scan.learning import calibration_fit
+from torchcrf_scan.learning.calibration_fit import (
+    Judged,
+    calibrate,
+    fit_calibration,
+    fit_confidence,
+    fit_covariance_factor,
+    judge,
+    moving_share,
+)
 from torchcrf_scan.learning.methods import JOINT, Models, Study
 from torchcrf_scan.model import MatchingCRF
 from torchcrf_scan.scan import ScanPair
@@ -94,14 +104,17 @@ def test_what_there_are_too_few_answers_for_keeps_its_default(judged: tuple[list
     few = fit_calibration(found)
     assert few.covariance_factor == 1
     assert not torch.equal(few.association, Calibration().association)
-    none = Judged(*(getattr(found, name)[:0] for name in Judged.__slots__))
+    none = Judged.nothing()
     assert all(torch.equal(value, Calibration().state_dict()[name]) for name, value in fit_calibration(none).state_dict().items())
 
 
-def test_a_model_is_calibrated_on_the_pairs_it_was_fitted_on(study: Study, models: Models, small_config: Config) -> None:
+def test_a_model_is_calibrated_on_the_pairs_it_was_fitted_on(
+    study: Study, models: Models, small_config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whatever the calibration was before, and on the scans as they were before they were disturbed."""
     model = copy.deepcopy(models.joint[JOINT])
     material = 2 * study.collection.material(range(6), model.hypothesis_score, 4, small_config.learning)
+    monkeypatch.setattr(calibration_fit, "DOMINATED", 1.0)
     model.calibration.covariance_factor.fill_(7.0)
     model.calibration.association.fill_(-3.0)
     calibrate(model, material)
@@ -140,3 +153,28 @@ def test_a_model_of_one_chain_keeps_the_default(study: Study, models: Models, sm
 def test_nothing_to_join() -> None:
     with pytest.raises(ValueError, match=r"^parts: expected"):
         Judged.joined([])
+
+
+def test_scans_that_movers_dominate_do_not_count(
+    study: Study, models: Models, small_config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibration_fit, "DOMINATED", 0.45)
+    model = copy.deepcopy(models.joint[JOINT])
+    material = study.collection.material(range(4), model.hypothesis_score, 4, small_config.learning)
+    first = material[0].pairs[0]
+    assert first.annotation is not None
+    half = np.arange(len(first.annotation.body)) % 2
+    crowded = replace(first, annotation=replace(first.annotation, body=half))
+    assert moving_share(crowded) == pytest.approx(0.5, abs=0.1)
+    with_crowd = [replace(part, pairs=tuple(crowded if pair is first else pair for pair in part.pairs)) for part in material]
+    calibrate(model, with_crowd)
+    parts = []
+    plain = copy.deepcopy(models.joint[JOINT])
+    plain.calibration = Calibration()
+    for part in with_crowd:
+        with torch.no_grad():
+            prediction = plain(ScanPairBatch.collate(part.pairs).without_truth(), part.start)
+        parts.append(judge(part.pairs, prediction, [moving_share(pair) <= 0.45 for pair in part.pairs]))
+    expected = fit_calibration(Judged.joined(parts))
+    assert torch.equal(model.calibration.association, expected.association)
+    assert torch.equal(model.calibration.cluster, expected.cluster)

@@ -19,6 +19,7 @@ from torchcrf_scan.learning.material import Material
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import Bools, Floats, ScanPair
 
+DOMINATED = 1 / 3  # share of a scan's known points that move, from which on movers dominate it
 FEWEST_PAIRS = 10  # that a factor of the covariances is fitted on
 FIT_QUANTILE = 0.9  # at which the covariances' factor is fitted: up to a tenth of the pairs may have a wrong background
 
@@ -41,6 +42,12 @@ class Judged:
     nees: Floats
 
     @classmethod
+    def nothing(cls) -> Judged:
+        """No answers."""
+        number, flag = np.zeros(0), np.zeros(0, dtype=bool)
+        return cls(number, flag, flag, number, flag, number)
+
+    @classmethod
     def joined(cls, parts: Sequence[Judged]) -> Judged:
         """All parts as one. Raises ValueError for none."""
         if not parts:
@@ -53,24 +60,45 @@ def calibrate(model: JointScanCRF, material: Sequence[Material]) -> None:
     """Fits the calibration of a fitted model in place, on the pairs and from the starts that it was fitted on.
 
     The scans are those from before they were disturbed: disturbance moves whole scans, and covariances that account for it would
-    be four to six times too large for others. What was fitted before does not matter. A model of one chain keeps the default.
+    be four to six times too large for others. Scans that movers dominate are left out, where there are others: those are read right
+    or wrong as a whole, of which a point's belief knows nothing. What was fitted before does not matter. A model of one chain keeps
+    the default.
     """
     model.calibration.load_state_dict(Calibration().state_dict())
     if model.config.chains != "joint":
         return
+    pairs = [pair for part in material for pair in part.pairs]
+    dominated = {id(pair) for pair in pairs if moving_share(pair) > DOMINATED}
+    dominated = dominated if len(dominated) < len(pairs) else set()
     parts = []
     for part in material:
         batch = ScanPairBatch.collate(part.pairs).without_truth()
-        parts.append(judge(part.pairs, model(batch, part.start)))
+        parts.append(judge(part.pairs, model(batch, part.start), [id(pair) not in dominated for pair in part.pairs]))
     model.calibration.load_state_dict(fit_calibration(Judged.joined(parts)).state_dict())
 
 
+def moving_share(pair: ScanPair) -> float:
+    """Share of the returns with a known body that belong to movers; 0 where there are none."""
+    assert pair.annotation is not None
+    body = pair.annotation.body[~pair.annotation.ignore]
+    return float((body > 0).sum() / max((body >= 0).sum(), 1))
+
+
 @torch.no_grad()
-def judge(pairs: Sequence[ScanPair], prediction: Prediction) -> Judged:
-    """Compares the prediction of a batch with the annotation of its B pairs. Raises ValueError for a pair without one."""
+def judge(pairs: Sequence[ScanPair], prediction: Prediction, counts: Sequence[bool] | None = None) -> Judged:
+    """Compares the prediction of a batch with the annotation of its B pairs.
+
+    Args:
+        counts: (B,) which of the pairs count; None: all.
+
+    Raises:
+        ValueError: a pair without annotation.
+    """
     association, cluster = association_log_odds(prediction), cluster_log_odds(prediction)
-    parts = []
+    parts = [Judged.nothing()]
     for b, pair in enumerate(pairs):
+        if counts is not None and not counts[b]:
+            continue
         answer = prediction.pair(b, pair)
         right, nees = rightness(pair, answer, WITHIN), np.array([background_nees(pair, answer)])
         known, n = right.known, len(pair.source)
