@@ -7,6 +7,10 @@ from dataclasses import dataclass, field, replace
 
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 
+LEFT_OUT = (
+    *("association.pairwise_distance", "association.pairwise_translation"),
+    *("clustering.gate", "clustering.outlier_bias"),
+)  # by default
 WEIGHTS = (*(f"association.{name}" for name in ASSOCIATION_WEIGHTS), *(f"clustering.{name}" for name in CLUSTERING_WEIGHTS))
 
 
@@ -161,8 +165,8 @@ class FeatureConfig:
         decisions: what parts inliers from outliers and the nearest target point from others, as extension weights of both chains:
             a gate on the residual, a constant, the lead of the nearest. This and `free_space` off: the paper's 30.
         left_out: features that the model does without, as `association.NAME` or `clustering.NAME` of a weight; a local channel is
-            then hidden from the boosters too. By default the two that compare an edge's length: where a surface is sampled sparsely
-            they call its points outliers.
+            then hidden from the boosters too. By default the two that compare an edge's length, which call sparsely sampled
+            surfaces outliers, and the decisions of the clustering chain, which cost it movers.
     """
 
     raw_channels: bool = True
@@ -171,7 +175,7 @@ class FeatureConfig:
     stumps: int = 50
     free_space: bool = True
     decisions: bool = True
-    left_out: tuple[str, ...] = ("association.pairwise_distance", "association.pairwise_translation")
+    left_out: tuple[str, ...] = LEFT_OUT
 
     def __post_init__(self) -> None:
         for name in self.left_out:
