@@ -11,7 +11,7 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
 from torchcrf_scan.inference.hypothesis_features import FEATURES, hypothesis_features
-from torchcrf_scan.inference.movers import PRODUCTS, HypothesisScore, Movers, find_movers, select
+from torchcrf_scan.inference.movers import PRODUCTS, HypothesisScore, Movers, select
 from torchcrf_scan.inference.surface import Surface
 from torchcrf_scan.learning.hypothesis_fit import (
     IGNORED,
@@ -61,7 +61,8 @@ def cast(segments: list[tuple[float, ...]], seed: int) -> Tensor:
 
 def movers_of(source: Surface, target: Surface, background: Tensor, dt: float, score: HypothesisScore) -> Movers:
     hypotheses = hypothesise(source, target, background, dt)
-    return find_movers(hypotheses, hypothesis_features(hypotheses, source, target, background), source, target, score)
+    probabilities = score(hypothesis_features(hypotheses, source, target, background))
+    return select(hypotheses, probabilities, source, target, threshold=float(score.threshold), most=6)
 
 
 def scene(moving: tuple[str, ...] = ("ahead", "across"), steps: dict[str, Tensor] = STEPS) -> tuple[Surface, Surface]:

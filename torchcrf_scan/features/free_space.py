@@ -44,7 +44,7 @@ class Sweep:
         arms = points - origin[:, None]
         ranges = torch.linalg.vector_norm(arms, dim=-1)
         count = mask.sum(-1)
-        turns = turn(torch.atan2(arms[..., 1], arms[..., 0]).diff(dim=1)).masked_fill(~mask[:, 1:], 0.0)  # (B, N-1)
+        turns = rising_turn(torch.atan2(arms[..., 1], arms[..., 0]).diff(dim=1)).masked_fill(~mask[:, 1:], 0.0)  # (B, N-1)
         first = torch.atan2(arms[:, :1, 1], arms[:, :1, 0])
         bearings = torch.cat([first, first + turns.cumsum(1)], dim=1).masked_fill(~mask, torch.inf)
         known = pad(turns.masked_fill(~mask[:, 1:], torch.nan), (0, 1), value=torch.nan)  # one point has no turn
@@ -52,7 +52,7 @@ class Sweep:
         return cls(origin, ranges, bearings, count, closed, step, noise)
 
 
-def turn(difference: Tensor) -> Tensor:
+def rising_turn(difference: Tensor) -> Tensor:
     """Counter-clockwise angle in [0, 2 pi); a step back by rounding is no turn."""
     return ((difference + 1e-4) % (2 * math.pi) - 1e-4).clamp(min=0)
 
@@ -86,7 +86,9 @@ def look(scan: Sweep, points: Tensor) -> FreeSpace:
         right = torch.where(is_closed, after % (last + 1), torch.minimum(after, last))
         left = torch.minimum(left, last)
         inside = is_closed | (bearing <= scan.bearings.gather(1, last) + half)
-        beside = torch.maximum(turn(bearing - scan.bearings.gather(1, left)), turn(scan.bearings.gather(1, right) - bearing))
+        beside = torch.maximum(
+            rising_turn(bearing - scan.bearings.gather(1, left)), rising_turn(scan.bearings.gather(1, right) - bearing)
+        )
         beside = beside.nan_to_num(nan=torch.inf)
         measured = inside & ((beside < WIDEST_GAP * step) | (left == right)) & (scan.count[:, None] > 0)
         near = torch.minimum(scan.ranges.gather(1, left), scan.ranges.gather(1, right))

@@ -180,10 +180,3 @@ def _are_near(members: Tensor, points: Tensor, unit: Tensor) -> Tensor:
     gap = torch.maximum(low[:, None] - high, low - high[:, None]).clamp(min=0)  # (h, g, 2) between the boxes round them
     reach = torch.linalg.vector_norm(high - low, dim=-1) / 2 + APART * unit
     return torch.linalg.vector_norm(gap, dim=-1) < reach
-
-
-def find_movers(
-    hypotheses: Hypotheses, features: Tensor, source: Surface, target: Surface, score: HypothesisScore, *, most: int = 6
-) -> Movers:
-    """The hypotheses that the score accepts. features: (H, F) of `hypothesis_features`; most: movers at most."""
-    return select(hypotheses, score(features), source, target, threshold=float(score.threshold), most=most)

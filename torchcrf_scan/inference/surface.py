@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchcrf_scan.features.free_space import rising_turn
 from torchcrf_scan.geometry import se2
 
 if TYPE_CHECKING:
@@ -59,10 +60,10 @@ class Surface:
 
         origin = torch.zeros_like(points[0]) if origin is None else origin
         ranges, bearings = _look_from(origin, points)
-        bearings = torch.cat([bearings[:1], _turn(bearings.diff())]).cumsum(0)  # rising through the scan
+        bearings = torch.cat([bearings[:1], rising_turn(bearings.diff())]).cumsum(0)  # rising through the scan
         following = points.roll(-1, 0) - points  # (P, 2), the last one leads round
         gap = torch.linalg.vector_norm(following, dim=-1)
-        turn = _turn(bearings.roll(-1, 0) - bearings)
+        turn = rising_turn(bearings.roll(-1, 0) - bearings)
         step = turn[:-1].median() if len(points) > 1 else turn.new_tensor(math.radians(0.5))
         joined = gap <= _largest_gap(torch.minimum(ranges, ranges.roll(-1, 0)), turn, noise)
         joined &= turn < GRAZING
@@ -97,11 +98,6 @@ def _look_from(origin: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """(...,) ranges and bearings of (..., 2) points as seen from (2,)."""
     ray = points - origin
     return torch.linalg.vector_norm(ray, dim=-1), torch.atan2(ray[..., 1], ray[..., 0])
-
-
-def _turn(difference: Tensor) -> Tensor:
-    """Counter-clockwise angle in [0, 2 pi); a step back by rounding is no turn."""
-    return ((difference + 1e-4) % (2 * math.pi) - 1e-4).clamp(min=0)
 
 
 def _largest_gap(ranges: Tensor, turn: Tensor, noise: Tensor) -> Tensor:
@@ -147,7 +143,7 @@ def look_along(moved: Tensor, scan: Surface, margin: float = 3.0) -> Sight:
         left, right = (after - 1) % M, after % M
     else:
         left, right = (after - 1).clamp(min=0), after.clamp(max=M - 1)
-    apart = torch.maximum(_turn(bearings - scan.bearings[left]), _turn(scan.bearings[right] - bearings)).minimum(
+    apart = torch.maximum(rising_turn(bearings - scan.bearings[left]), rising_turn(scan.bearings[right] - bearings)).minimum(
         torch.where(left == right, half_step, torch.inf)
     )
     measured = (inside | scan.is_closed) & (apart < 2.5 * scan.step)
