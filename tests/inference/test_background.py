@@ -26,6 +26,7 @@ from torchcrf_scan.inference.background import (
     background_cost,
     background_pool,
     distinct,
+    follow,
     refine,
     segment_hypotheses,
     slide,
@@ -238,6 +239,18 @@ def test_a_wrong_guess_spoils_nothing(street: ScanPairBatch) -> None:
     truth = street.truth.motions[:, 0]
     wrong = torch.tensor([[0.3, 3.0, -1.0], [0.0, -3.0, 0.0], [-0.4, 0.0, 3.0]]).repeat(2, 1)
     assert right(backgrounds(replace(street, initial_motion=se2.compose(wrong, truth))), truth) == 6
+
+
+def test_a_right_guess_is_followed_and_no_guess_leads_astray(street: ScanPairBatch) -> None:
+    assert street.truth is not None
+    truth = street.truth.motions[:, 0]
+    nearly = se2.compose(torch.tensor([0.03, 0.1, -0.1]).expand(6, 3), truth)
+    wrong = se2.compose(torch.tensor([0.3, 3.0, -1.0]).expand(6, 3), truth)
+    for guesses, least, most in ((nearly, 5, 6), (wrong, 0, 2)):
+        followed = {b: follow(guess, *sides(street, b)) for b, guess in enumerate(guesses)}
+        led = {b: motion for b, motion in followed.items() if motion is not None}
+        assert least <= len(led) <= most
+        assert not led or right(torch.stack([*led.values()]), truth[[*led]]) == len(led)
 
 
 def test_a_right_guess_rescues_what_the_search_cannot_find(street: ScanPairBatch) -> None:

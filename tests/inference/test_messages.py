@@ -18,6 +18,8 @@ from torchcrf_scan.inference.messages import (
     chain_messages,
     log_partition,
     normalise,
+    pass_in_blocks,
+    pass_node_by_node,
     reduce_states,
     silence_padding,
 )
@@ -286,3 +288,14 @@ def test_identical_scans_are_matched_point_by_point(n: int, seed: int) -> None:
     pairwise = pairwise_features(points, points, candidates, scales) @ torch.tensor([1.0, -1.0, 1.0, 1.0]).double()
     labels = chain_beliefs(unary, pairwise, all_real(points)).argmax(-1)
     assert labels[0].tolist() == np.arange(n).tolist()
+
+
+@given(st.integers(0, 40), STATES, st.sampled_from([0.0, 0.5, 1.0]), st.booleans(), SEEDS)
+def test_blocks_pass_on_what_node_after_node_passes_on(E: int, S: int, temperature: float, impossible: bool, seed: int) -> None:
+    unary, pairwise = make_chain(E + 1, S, seed, impossible=impossible)
+    edges = (unary[:, :-1, :, None] + pairwise).requires_grad_()
+    found, expected = (pass_on(edges, temperature) for pass_on in (pass_in_blocks, pass_node_by_node))
+    assert_close(found, expected)
+    if E and not impossible:
+        slopes = normal(*found.shape, seed=seed)
+        assert_close(*(torch.autograd.grad((m * slopes).sum(), edges)[0] for m in (found, expected)))

@@ -49,7 +49,7 @@ def by_motion(
         B, C = active.shape
         nearest = torch.zeros(B, source_points.shape[1], C, dtype=torch.int64, device=active.device)
         over_motions = source_points.new_full((B, source_points.shape[1], target_points.shape[1]), torch.inf)
-        for c in active.any(0).nonzero()[:, 0].tolist():  # a motion at a time: the largest tensor stays (B, N, M)
+        for c in range(C):  # a motion at a time: the largest tensor stays (B, N, M)
             distance = squared_distances(se2.apply(motions[:, c], source_points), target_points, target_mask)
             nearest[..., c] = torch.where(active[:, c, None], distance.argmin(-1), 0)
             over_motions = torch.where(active[:, c, None, None], torch.minimum(over_motions, distance), over_motions)

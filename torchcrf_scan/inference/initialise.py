@@ -18,7 +18,7 @@ from torchcrf_scan.batch import ScanPairBatch, scale_motions
 from torchcrf_scan.features.candidates import squared_distances
 from torchcrf_scan.features.potentials import PairView, possible_clusters, resolution
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.background import background_pool, unit_length
+from torchcrf_scan.inference.background import background_pool, follow, unit_length
 from torchcrf_scan.inference.cold import ransac_motions, shape_association
 from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
 from torchcrf_scan.inference.hypothesis_features import hypothesis_features
@@ -90,21 +90,41 @@ def initialise(batch: ScanPairBatch, score: HypothesisScore, clusters: int) -> S
 
 @torch.no_grad()
 def survey(batch: ScanPairBatch) -> list[Survey | None]:
-    """Surfaces, background and hypotheses of every pair; None where a scan has fewer than three points."""
-    shape_matches = shape_association(PairView.of(batch, length_unit="spacing"))
+    """Surfaces, background and hypotheses of every pair; None where a scan has fewer than three points.
+
+    A guess of the background's motion is followed first; only where it explains too little, or there is none, is the motion
+    searched for.
+    """
+    surfaces = [_surfaces(batch, b) for b in range(len(batch))]
+    backgrounds = [_follow_guess(pair, guess) for pair, guess in zip(surfaces, batch.initial_motion, strict=True)]
+    lost = {b: pair for b, pair in enumerate(surfaces) if pair is not None and backgrounds[b] is None}
+    if lost:
+        matches = shape_association(PairView.of(batch.select(torch.tensor([*lost])), length_unit="spacing"))
+        for (b, scans), match in zip(lost.items(), matches, strict=True):
+            backgrounds[b] = find_background(*scans, batch.initial_motion[b], match[: len(scans[0])])
     found: list[Survey | None] = []
-    for b in range(len(batch)):
-        n, m = int(batch.source_mask[b].sum()), int(batch.target_mask[b].sum())
-        if min(n, m) < FEWEST_POINTS:
+    for pair, background, dt in zip(surfaces, backgrounds, batch.dt, strict=True):
+        if pair is None or background is None:
             found.append(None)
             continue
-        source = Surface.of(batch.source[b, :n], batch.range_noise[b], bool(batch.source_closed[b]))
-        target = Surface.of(batch.target[b, :m], batch.range_noise[b], bool(batch.target_closed[b]), batch.target_origin[b])
-        background = find_background(source, target, batch.initial_motion[b], shape_matches[b, :n])
-        hypotheses = hypothesise(source, target, background, float(batch.dt[b]))
-        features = hypothesis_features(hypotheses, source, target, background)
-        found.append(Survey(source, target, background, hypotheses, features))
+        hypotheses = hypothesise(*pair, background, float(dt))
+        found.append(Survey(*pair, background, hypotheses, hypothesis_features(hypotheses, *pair, background)))
     return found
+
+
+def _surfaces(batch: ScanPairBatch, b: int) -> tuple[Surface, Surface] | None:
+    """Both scans of pair b; None where one has fewer than three points."""
+    n, m = int(batch.source_mask[b].sum()), int(batch.target_mask[b].sum())
+    if min(n, m) < FEWEST_POINTS:
+        return None
+    source = Surface.of(batch.source[b, :n], batch.range_noise[b], bool(batch.source_closed[b]))
+    target = Surface.of(batch.target[b, :m], batch.range_noise[b], bool(batch.target_closed[b]), batch.target_origin[b])
+    return source, target
+
+
+def _follow_guess(pair: tuple[Surface, Surface] | None, guess: Tensor) -> Tensor | None:
+    """(3,) what a guess (3,) leads to; None without one: the identity says nothing."""
+    return follow(guess, *pair) if pair is not None and bool(guess.any()) else None
 
 
 @torch.no_grad()

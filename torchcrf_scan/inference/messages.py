@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
+
+LARGEST_BLOCKS = 4_000  # B S^3 above which the S-fold arithmetic of blocks costs more than the steps that they save
 
 
 def reduce_states(log_values: Tensor, dim: int, temperature: float) -> Tensor:
@@ -36,7 +39,7 @@ def silence_padding(log_unary: Tensor, log_pairwise: Tensor, mask: Tensor) -> tu
 
 
 def chain_messages(log_unary: Tensor, log_pairwise: Tensor, temperature: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Forward and backward messages of B chains (spec 7.1), both directions at once, N - 1 steps.
+    """Forward and backward messages of B chains (spec 7.1), both directions at once.
 
     Args:
         log_unary: (B, N, S). log_pairwise: (B, N-1, S, S), row = state of node i, column = state of node i + 1.
@@ -48,13 +51,46 @@ def chain_messages(log_unary: Tensor, log_pairwise: Tensor, temperature: float =
     both_unary = torch.cat([log_unary, log_unary.flip(1)])  # (2B, N, S)
     both_pairwise = torch.cat([log_pairwise, log_pairwise.flip(1).transpose(-1, -2)])
     outgoing = both_unary[:, :-1, :, None] + both_pairwise  # (2B, N-1, S, S)
-    message = torch.zeros_like(both_unary[:, 0])
-    messages = [message]
-    for step in outgoing.unbind(1):
-        message = normalise(reduce_states(step + message[:, :, None], 1, temperature))
-        messages.append(message)
-    forward, backward = torch.stack(messages, dim=1).chunk(2)
+    first = torch.zeros_like(both_unary[:, :1])
+    B, _, S = log_unary.shape
+    pass_on = pass_in_blocks if B * S**3 <= LARGEST_BLOCKS else pass_node_by_node
+    forward, backward = torch.cat([first, pass_on(outgoing, temperature)], dim=1).chunk(2)
     return forward, backward.flip(1)
+
+
+def pass_node_by_node(outgoing: Tensor, temperature: float) -> Tensor:
+    """(B, E, S) messages that leave E edges, normalised, from (B, E, S, S) potentials of edges with the node before; E steps."""
+    message = torch.zeros_like(outgoing[:, :1, 0])[:, 0] if outgoing.shape[1] else outgoing[:, :0, 0]
+    messages = []
+    for edge in outgoing.unbind(1):
+        message = normalise(reduce_states(edge + message[:, :, None], 1, temperature))
+        messages.append(message)
+    return torch.stack(messages, dim=1) if messages else outgoing[:, :, 0]
+
+
+def pass_in_blocks(outgoing: Tensor, temperature: float) -> Tensor:
+    """The same in about 2 sqrt(E) steps: sqrt(E) blocks at once, each for every state that may enter it, then from block to block.
+
+    S times the arithmetic in far fewer and larger operations, which wins for few states.
+    """
+    B, E, S, _ = outgoing.shape
+    length = max(1, math.isqrt(max(E, 1)))
+    missing = -E % length
+    stay = torch.full((S, S), -torch.inf, dtype=outgoing.dtype, device=outgoing.device).fill_diagonal_(0.0)
+    edges = torch.cat([outgoing, stay.expand(B, missing, S, S)], dim=1).unflatten(1, (-1, length))  # (B, blocks, length, S, S)
+    across = list(edges[:, :, :1].unbind(2))  # from the entry of every block to its every edge
+    for edge in edges.unbind(2)[1:]:
+        across.append(reduce_states(across[-1][..., None] + edge[:, :, None], -2, temperature))
+    entry = torch.zeros_like(outgoing[:, :1, 0])[:, 0] if E else outgoing.new_zeros(B, S)
+    entries = []
+    for block in across[-1].unbind(1):
+        entries.append(entry)
+        entry = normalise(reduce_states(entry[:, :, None] + block, 1, temperature))
+    if not entries:
+        return outgoing[:, :, 0]
+    entered = torch.stack(entries, dim=1)[:, :, None, :, None]  # (B, blocks, 1, S, 1)
+    messages = normalise(reduce_states(entered + torch.stack(across, dim=2), -2, temperature))
+    return messages.flatten(1, 2)[:, :E]
 
 
 def log_partition(log_unary: Tensor, log_pairwise: Tensor, temperature: float = 1.0) -> Tensor:

@@ -62,13 +62,13 @@ def discard_vacuous(view: PairView, start: Start, state: State, parameters: Para
     """The state without the clusters that are worth less than nothing. Movers only; needs `start.log_odds`."""
     assert start.log_odds is not None
     for _ in range(state.motions.active.shape[1] - 1):
-        if not bool(state.motions.active[:, 1:].any()):
+        if config.stop_early and not bool(state.motions.active[:, 1:].any()):
             break
         worth = parameters.potential(evidence(view, start, state, parameters, config), start.log_odds)  # (B, C)
         is_mover = torch.arange(worth.shape[1], device=worth.device) > 0
         least, which = worth.masked_fill(~(state.motions.active & is_mover), torch.inf).min(-1)
         is_vacuous = torch.nn.functional.one_hot(which, worth.shape[1]).bool() & (least < 0)[:, None]
-        if not bool(is_vacuous.any()):
+        if config.stop_early and not bool(is_vacuous.any()):
             break
         state = replace(state, motions=replace(state.motions, active=state.motions.active & ~is_vacuous))
     return state
@@ -86,16 +86,16 @@ def evidence(view: PairView, start: Start, state: State, parameters: Parameters,
     local = clustering_unary(view, at, motions.value, motions.active, parameters.scales)
     pairwise = clustering.pairwise_features(batch.source, at, parameters.scales)
 
-    def log_total(active: Tensor) -> Tensor:
-        possible = possible_clusters(active, start.reach, batch.source.shape[1])
-        potentials = clustering_potentials(local, pairwise, possible, parameters.clustering)
-        return log_partition(*silence_padding(*potentials, batch.source_mask))
-
-    whole = log_total(motions.active)
-    columns = [torch.zeros_like(whole)]
-    for k in range(1, motions.active.shape[1]):
-        without = motions.active.clone()
-        without[:, k] = False
-        is_there = bool(motions.active[:, k].any())
-        columns.append(whole - log_total(without) if is_there else torch.zeros_like(whole))
-    return torch.stack(columns, dim=1)
+    B, C = motions.active.shape
+    there = motions.active.expand(C, B, C).clone()  # row 0: all clusters; row k: without cluster k
+    there[1:] &= ~torch.eye(C, dtype=torch.bool, device=there.device)[1:, None]
+    possible = torch.stack([possible_clusters(row, start.reach, batch.source.shape[1]) for row in there])  # (C, B, N, D)
+    log_unary, log_pairwise = clustering_potentials(local, pairwise, torch.ones_like(possible[0]), parameters.clustering)
+    totals = log_partition(
+        *silence_padding(
+            log_unary.masked_fill(~possible, -torch.inf).flatten(0, 1),
+            log_pairwise.expand(C, *log_pairwise.shape).flatten(0, 1),
+            batch.source_mask.expand(C, *batch.source_mask.shape).flatten(0, 1),
+        )
+    ).view(C, B)
+    return (totals[0] - totals).mT
