@@ -21,7 +21,8 @@ KEPT = 12  # so many of all are worth a polish,
 REFINED = 5  # and so many of the polished ones a refinement
 TRUNCATION = 3.0  # a residual of three units is as bad as any
 CONTRADICTION = 3.0  # units charged for a point that the other scan sees through (design finding 17)
-TRUSTED = 2.5  # units both ways; a guess that leaves no more unexplained once it is refined has led to the background
+TRUSTED = 2.5  # units both ways; a guess that leaves no more unexplained once it is refined has led to the background,
+FOLLOWED = 8.0  # units; if refining has moved half of the points no farther than this
 UNSEEN = 1.5  # units charged for a point of which the other scan says nothing; else flying off the map would be free
 LENGTH_SHARE = (0.25, 4.0)  # median lengths of surface that a point stands for at least and at most, where it pulls,
 COST_SHARE = (0.1, 10.0)  # and where motions are compared
@@ -113,10 +114,13 @@ def background_pool(source: Surface, target: Surface, guess: Tensor, extra: Tens
 def follow(guess: Tensor, source: Surface, target: Surface) -> Tensor | None:
     """(3,) the background's motion near a guess (3,), as odometry or the last motion gives it; None where it explains too little.
 
-    Spares the search: a guess within half a metre and 8 degrees mostly leads to the motion that the search would find.
+    Spares the search: a guess within 20 cm and 3 degrees nearly always leads to the motion that the search would find.
     """
-    motion = refine(polish(guess[None], source, target, float(unit_length(source, target))), source, target)
-    return motion[0] if bool(background_cost(motion, source, target) < TRUSTED) else None
+    unit = unit_length(source, target)
+    motion = refine(polish(guess[None], source, target, float(unit)), source, target)[0]
+    led = torch.linalg.vector_norm(se2.apply(motion, source.points) - se2.apply(guess, source.points), dim=-1).median()
+    is_led = bool(led < FOLLOWED * unit) and bool(background_cost(motion[None], source, target) < TRUSTED)
+    return motion if is_led else None
 
 
 def search_coarsely(motions: Tensor, source: Surface, target: Surface, unit: float) -> Tensor:
