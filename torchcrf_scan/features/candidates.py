@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
 from torchcrf_scan.geometry import se2
+
+LARGEST_BLOCK = 2_000_000  # distances that are held at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,22 +45,30 @@ def by_motion(
 
     Args:
         source_points: (B, N, 2); target_points: (B, M, 2); target_mask: (B, M); motions: (B, C, 3); active: (B, C).
-        count: K; time grows with B C N M, memory with B N M.
+        count: K; time grows with B C N M.
     """
     with torch.no_grad():  # a choice of states, not a function to follow
-        B, C = active.shape
-        nearest = torch.zeros(B, source_points.shape[1], C, dtype=torch.int64, device=active.device)
-        over_motions = source_points.new_full((B, source_points.shape[1], target_points.shape[1]), torch.inf)
-        for c in range(C):  # a motion at a time: the largest tensor stays (B, N, M)
-            distance = squared_distances(se2.apply(motions[:, c], source_points), target_points, target_mask)
-            nearest[..., c] = torch.where(active[:, c, None], distance.argmin(-1), 0)
-            over_motions = torch.where(active[:, c, None, None], torch.minimum(over_motions, distance), over_motions)
-        if count == 0 or count >= target_points.shape[1]:
-            return Candidates(*every_target(source_points, target_mask), nearest)
-        closest, index = over_motions.topk(count, dim=-1, largest=False)
-        mask = closest < torch.inf
-        order = torch.where(mask, index, target_points.shape[1]).argsort(-1)  # real ones first, ascending
-        return Candidates(index.gather(-1, order), mask.gather(-1, order), nearest)
+        size = max(1, LARGEST_BLOCK // max(1, target_mask.numel()))
+        blocks = [_by_motion(part, target_points, target_mask, motions, active, count) for part in source_points.split(size, dim=1)]
+        return Candidates(*(torch.cat([getattr(block, f.name) for block in blocks], dim=1) for f in fields(Candidates)))
+
+
+def _by_motion(
+    source_points: Tensor, target_points: Tensor, target_mask: Tensor, motions: Tensor, active: Tensor, count: int
+) -> Candidates:
+    B, C = active.shape
+    nearest = torch.zeros(B, source_points.shape[1], C, dtype=torch.int64, device=active.device)
+    over_motions = source_points.new_full((B, source_points.shape[1], target_points.shape[1]), torch.inf)
+    for c in range(C):  # a motion at a time: the largest tensor stays (B, N, M)
+        distance = squared_distances(se2.apply(motions[:, c], source_points), target_points, target_mask)
+        nearest[..., c] = torch.where(active[:, c, None], distance.argmin(-1), 0)
+        over_motions = torch.where(active[:, c, None, None], torch.minimum(over_motions, distance), over_motions)
+    if count == 0 or count >= target_points.shape[1]:
+        return Candidates(*every_target(source_points, target_mask), nearest)
+    closest, index = over_motions.topk(count, dim=-1, largest=False)
+    mask = closest < torch.inf
+    order = torch.where(mask, index, target_points.shape[1]).argsort(-1)  # real ones first, ascending
+    return Candidates(index.gather(-1, order), mask.gather(-1, order), nearest)
 
 
 def every_target(source_points: Tensor, target_mask: Tensor) -> tuple[Tensor, Tensor]:

@@ -25,6 +25,7 @@ from torchcrf_scan.features.scales import (
 from torchcrf_scan.features.shape import ShapeDescriptors, describe, local_spacing
 from torchcrf_scan.geometry import se2
 
+LARGEST_BLOCK = 500_000  # pairs of points that are compared in shape at once
 OUTLIER_INPUTS = len(LOCAL_CHANNELS) + 2
 REFERENCE_UNIT = 0.1  # metres; the resolution of a street scanner, so that scales keep their usual size in the unit `spacing`
 
@@ -210,12 +211,28 @@ def find_candidates(view: PairView, motions: Tensor, active: Tensor, config: Inf
         guess = batch.initial_motion[:, None]
         found = candidates.by_motion(*scans, guess, torch.ones_like(active[:, :1]), config.candidates)
         return replace(found, nearest=nearest)
-    return Candidates(*candidates.by_score(shape_score(view), batch.target_mask, config.candidates), nearest)
+    index, mask, _ = most_alike(view, config.candidates)
+    return Candidates(index, mask, nearest)
 
 
 @torch.no_grad()
-def shape_score(view: PairView) -> Tensor:
-    """(B, N, M) how alike the surroundings of two points are: mean of L1..L9 with the scales of a street scanner."""
-    every, _ = candidates.every_target(view.batch.source, view.batch.target_mask)
+def shape_score(view: PairView, rows: slice = slice(None)) -> Tensor:
+    """(B, n, M) how alike the surroundings of some source and all target points are: mean of L1..L9, a street's scales."""
+    source = view.source_shape
+    some = ShapeDescriptors(source.distance[:, rows], source.geodesic[:, rows], source.angle[:, rows], source.radius[:, rows])
+    every, _ = candidates.every_target(some.radius, view.batch.target_mask)
     scales = Scales().to(view.batch.source)
-    return association.shape_features(view.source_shape, view.target_shape, every, scales).mean(-1)
+    return association.shape_features(some, view.target_shape, every, scales).mean(-1)
+
+
+def most_alike(view: PairView, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Index, mask and score (B, N, K) of the `count` target points most alike in shape, a block of source points at a time."""
+    N, target_mask = view.batch.source.shape[1], view.batch.target_mask
+    size = max(1, LARGEST_BLOCK // max(1, target_mask.numel()))
+    blocks = []
+    for begin in range(0, max(N, 1), size):
+        score = shape_score(view, slice(begin, begin + size))
+        index, mask = candidates.by_score(score, target_mask, count)
+        blocks.append((index, mask, score.gather(-1, index)))
+    index, mask, score = (torch.cat(parts, dim=1) for parts in zip(*blocks, strict=True))
+    return index, mask, score

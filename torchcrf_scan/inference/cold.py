@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchcrf_scan.features import association, candidates
-from torchcrf_scan.features.potentials import PairView, shape_score, state_mask
+from torchcrf_scan.features import association
+from torchcrf_scan.features.potentials import PairView, most_alike, state_mask
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
@@ -24,9 +24,8 @@ def shape_association(view: PairView) -> Tensor:
     Costs N M for the choice of candidates.
     """
     batch, scales = view.batch, Scales().to(view.batch.source)
-    score = shape_score(view)  # (B, N, M)
-    index, mask = candidates.by_score(score, batch.target_mask, CANDIDATES)
-    log_unary = torch.cat([score.gather(-1, index), score.new_full((*score.shape[:2], 1), OUTLIER_SCORE)], dim=-1)
+    index, mask, score = most_alike(view, CANDIDATES)
+    log_unary = torch.cat([score, score.new_full((*score.shape[:2], 1), OUTLIER_SCORE)], dim=-1)
     log_unary = log_unary.masked_fill(~state_mask(mask), -torch.inf)
     pairwise = association.pairwise_features(batch.source, batch.target, index, scales)
     weights = pairwise.new_tensor([2.0, -1.0, 0.5, 0.0])  # sequence, switching, distance; translation is not invariant
