@@ -15,6 +15,7 @@ from torch.nn.functional import pad
 
 SLACK_STEPS = 3.0  # beam spacings and noises that a range may differ by,
 SLACK_SHARE = 0.02  # and share of the range: calibration, tilt
+BACKWARDS = 1e-4  # radians; a step back by so little is no turn
 WIDEST_GAP = 2.5  # beam steps between two returns from which on nothing is known between them
 
 
@@ -54,7 +55,7 @@ class Sweep:
 
 def rising_turn(difference: Tensor) -> Tensor:
     """Counter-clockwise angle in [0, 2 pi); a step back by rounding is no turn."""
-    return ((difference + 1e-4) % (2 * math.pi) - 1e-4).clamp(min=0)
+    return ((difference + BACKWARDS) % (2 * math.pi) - BACKWARDS).clamp(min=0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,16 @@ FOLLOWED = 8.0  # units; if refining has moved half of the points no farther tha
 UNSEEN = 1.5  # units charged for a point of which the other scan says nothing; else flying off the map would be free
 LENGTH_SHARE = (0.25, 4.0)  # median lengths of surface that a point stands for at least and at most, where it pulls,
 COST_SHARE = (0.1, 10.0)  # and where motions are compared
+GRID_REACH = 0.12  # of the usual range: the unit of the grid's shifts
+GRID_SHIFTS = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (2.5, 0.0), (-2.5, 0.0))
+GRID_TURNS = (0.0, 0.12, -0.12, 0.3, -0.3)  # radians
+ALIKE_TURN = 0.02  # radians up to which two motions may be the same
+SMALLEST_SEGMENT, SEGMENTS = 6, 12  # points of a segment that is registered alone, and how many segments are
+# Gates in units (of `refine`: of the residual), and how much of the residual along the surface counts, one per iteration.
+COARSE_GATES, COARSE_ALONG = (8.0, 8.0, 6.0, 6.0, 4.0, 4.0, 3.0, 2.0), (1.0,) * 4 + (0.3,) * 4
+SEGMENT_GATES, SEGMENT_ALONG = (6.0, 4.0, 3.0, 2.0), (1.0, 1.0, 0.3, 0.3)
+POLISH_GATES, POLISH_ALONG = (4.0, 3.0, 2.0, 1.5), (0.1,) * 4
+REFINE_GATES, REFINE_ALONG = (3.0, 2.0, 2.0, 1.5, 1.5, 1.5), (0.03,) * 6
 
 
 def unit_length(source: Surface, target: Surface) -> Tensor:
@@ -63,9 +73,8 @@ def background_cost(motions: Tensor, source: Surface, target: Surface, most: int
 
 def start_grid(source: Surface, target: Surface) -> Tensor:
     """(H, 3) turns and shifts in shares of the scene's size."""
-    reach = 0.12 * torch.cat([source.ranges, target.ranges]).median()
-    turns = torch.tensor([0.0, 0.12, -0.12, 0.3, -0.3])
-    shifts = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [2.5, 0.0], [-2.5, 0.0]])
+    reach = GRID_REACH * torch.cat([source.ranges, target.ranges]).median()
+    turns, shifts = torch.tensor(GRID_TURNS), torch.tensor(GRID_SHIFTS)
     return torch.cat([turns.repeat_interleave(len(shifts))[:, None], shifts.repeat(len(turns), 1) * reach.cpu()], 1).to(
         source.points
     )
@@ -75,7 +84,7 @@ def distinct(motions: Tensor, cost: Tensor, near: Tensor, count: int) -> Tensor:
     """Index of the `count` cheapest motions of which no two are closer than `near` (metres; radians weigh ten units of it)."""
     order = cost.argsort()
     turn, shift = se2.distance(motions[order][:, None], motions[order][None])
-    alike = (shift < near) & (turn < 0.02)
+    alike = (shift < near) & (turn < ALIKE_TURN)
     kept: list[int] = []
     for row, is_like in enumerate(alike.tolist()):
         if not any(is_like[k] for k in kept):
@@ -126,8 +135,8 @@ def follow(guess: Tensor, source: Surface, target: Surface) -> Tensor | None:
 def search_coarsely(motions: Tensor, source: Surface, target: Surface, unit: float) -> Tensor:
     """Registers some of the source's points from afar."""
     some = slice(None, None, math.ceil(len(source) / COARSE_POINTS))
-    gates, along = [unit * gate for gate in (8.0, 8.0, 6.0, 6.0, 4.0, 4.0, 3.0, 2.0)], [1.0] * 4 + [0.3] * 4
-    return register(source.points[some], _share(source.length, *LENGTH_SHARE)[some], target, motions, gates, along)
+    gates = [unit * gate for gate in COARSE_GATES]
+    return register(source.points[some], _share(source.length, *LENGTH_SHARE)[some], target, motions, gates, COARSE_ALONG)
 
 
 def slide(motions: Tensor, target: Surface, unit: Tensor) -> Tensor:
@@ -140,25 +149,25 @@ def slide(motions: Tensor, target: Surface, unit: Tensor) -> Tensor:
     return torch.cat([turn, motions[:, None, 1:] + shift], dim=-1).flatten(0, 1)
 
 
-def segment_hypotheses(source: Surface, target: Surface, motions: Tensor, unit: float, smallest: int = 6, most: int = 12) -> Tensor:
+def segment_hypotheses(source: Surface, target: Surface, motions: Tensor, unit: float) -> Tensor:
     """Registers every larger segment alone: where most returns belong to a mover, some segment still is background."""
     sizes = torch.bincount(source.segment)
-    large = sizes.argsort(descending=True)[:most]
-    large = large[sizes[large] >= smallest]
+    large = sizes.argsort(descending=True)[:SEGMENTS]
+    large = large[sizes[large] >= SMALLEST_SEGMENT]
     members = (source.segment[None] == large[:, None]).sort(descending=True, stable=True).indices  # (S, P), members come first
     spread = torch.arange(SEGMENT_POINTS, device=members.device) * sizes[large, None] // SEGMENT_POINTS  # (S, L)
     points = source.points[members.gather(1, spread)].repeat_interleave(len(motions), 0)  # (S H, L, 2)
     starts = motions.repeat(len(large), 1)
-    gates = [unit * gate for gate in (6.0, 4.0, 3.0, 2.0)]
-    return register(points, torch.ones_like(points[..., 0]), target, starts, gates, [1.0, 1.0, 0.3, 0.3])
+    gates = [unit * gate for gate in SEGMENT_GATES]
+    return register(points, torch.ones_like(points[..., 0]), target, starts, gates, SEGMENT_ALONG)
 
 
 def polish(motions: Tensor, source: Surface, target: Surface, unit: float) -> Tensor:
     """Draws hypotheses that are still a few gates off to where `refine` can take over."""
-    gates = [unit * gate for gate in (4.0, 3.0, 2.0, 1.5)]
-    return register(source.points, _share(source.length, *LENGTH_SHARE), target, motions, gates, [0.1] * 4)
+    gates = [unit * gate for gate in POLISH_GATES]
+    return register(source.points, _share(source.length, *LENGTH_SHARE), target, motions, gates, POLISH_ALONG)
 
 
 def refine(motions: Tensor, source: Surface, target: Surface) -> Tensor:
     """Point-to-line registration of the whole scans on each other, from good starts, by the residual that the choice goes by."""
-    return register_both(source, target, motions, [3.0, 2.0, 2.0, 1.5, 1.5, 1.5], [0.03] * 6)
+    return register_both(source, target, motions, REFINE_GATES, REFINE_ALONG)

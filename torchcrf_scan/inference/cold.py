@@ -15,6 +15,7 @@ from torchcrf_scan.inference.messages import chain_beliefs
 CANDIDATES = 32
 OUTLIER_SCORE = -3.0  # mean channel value below which a place is no better than none
 SAMPLES = 256
+SEQUENCE, SWITCHING, DISTANCE = 2.0, -1.0, 0.5  # weights of the pairwise features; translation is not invariant
 
 
 def shape_association(view: PairView) -> Tensor:
@@ -28,7 +29,7 @@ def shape_association(view: PairView) -> Tensor:
     log_unary = torch.cat([score, score.new_full((*score.shape[:2], 1), OUTLIER_SCORE)], dim=-1)
     log_unary = log_unary.masked_fill(~state_mask(mask), -torch.inf)
     pairwise = association.pairwise_features(batch.source, batch.target, index, scales)
-    weights = pairwise.new_tensor([2.0, -1.0, 0.5, 0.0])  # sequence, switching, distance; translation is not invariant
+    weights = pairwise.new_tensor([SEQUENCE, SWITCHING, DISTANCE, 0.0])
     beliefs = chain_beliefs(log_unary, pairwise @ weights, batch.source_mask)
     best = beliefs.argmax(-1)
     padded = torch.cat([index, torch.full_like(index[..., :1], -1)], dim=-1)

@@ -28,6 +28,9 @@ SCREEN_POINTS = 8  # of a segment, to compare starts
 STARTS = 5  # of a segment, to register
 REGISTER_POINTS = 16
 USUAL_TURN = 0.1  # radians, standard deviation of a mover's turn between two scans
+PART = 0.7  # of a segment: its unexplained points, if they are fewer, may be an object before a wall
+SETTLE_GATES = (4.0, 3.0, 2.0, 2.0, 1.5, 1.5)  # units, one per iteration,
+SETTLE_ALONG = (1.0, 1.0, 0.5, 0.5, 0.2, 0.2)  # and how much of the residual along the surface counts
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +116,7 @@ def _groups(surface: Surface, residual: Tensor) -> Tensor:
     usual = torch.zeros_like(residual).scatter_reduce(0, piece, residual, "mean", include_self=False)
     whole = _holding(piece, is_open | (usual >= LIFTED)[piece])
     parts = segments & is_open  # an object before a wall may share its segment
-    is_part = parts.sum(-1) < 0.7 * segments.sum(-1)
+    is_part = parts.sum(-1) < PART * segments.sum(-1)
     groups = torch.cat([segments, whole, parts[is_part], runs, _neighbours(surface, segments), _neighbours(surface, whole)])
     groups = groups[groups.sum(-1) >= MIN_POINTS]
     return groups.unique(dim=0) if len(groups) else groups
@@ -225,8 +228,7 @@ def _settle(motions: Tensor, members: Tensor, source: Surface, target: Surface, 
     index, is_member = pick_members(members, REGISTER_POINTS)
     points, weights = source.points[index], is_member.to(source.points)
     unit = float(unit_length(source, target))
-    gates, along = [unit * gate for gate in (4.0, 3.0, 2.0, 2.0, 1.5, 1.5)], [1.0, 1.0, 0.5, 0.5, 0.2, 0.2]
-    motions = register(points, weights, target, motions, gates, along)
+    motions = register(points, weights, target, motions, [unit * gate for gate in SETTLE_GATES], SETTLE_ALONG)
     return _steady(motions, points, weights, background, unit_length(source, target))
 
 

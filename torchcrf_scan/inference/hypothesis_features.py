@@ -25,6 +25,8 @@ EXPLAINED = 1.0  # units up to which it is explained well
 FEATURE_POINTS = 24
 REACH = 6.0  # units, and the extent: how far from the members unexplained points of the target are asked for
 AROUND = 15  # beams
+RIVALS = 0.7  # share of points in common from which two hypotheses move nearly the same
+USUAL_UNITS, USUAL_COUNT = 2.0, 3.0  # units in all, and of how many points, that are added to those around: few say little
 JUMP = 4.0  # units of range that the beams beside an object go on, when it surely stands before them
 
 FEATURES = (
@@ -213,7 +215,7 @@ def _motion_features(hypotheses: Hypotheses, landing: Landing, source: Surface, 
 
 def _rival_features(hypotheses: Hypotheses, columns: dict[str, Tensor]) -> dict[str, Tensor]:
     """How much worse a hypothesis is than the best that moves nearly the same points."""
-    is_rival = share_in_common(hypotheses.members) > 0.7
+    is_rival = share_in_common(hypotheses.members) > RIVALS
 
     def short_of_best(values: Tensor) -> Tensor:
         return values - torch.where(is_rival, values, -torch.inf).amax(-1)
@@ -233,7 +235,7 @@ def _scene_features(hypotheses: Hypotheses, leftover: Leftover) -> dict[str, Ten
     beside, rest = wide - members, 1 - members
     is_open = (leftover.source >= OPEN).to(members)
     return {
-        "units_around": (beside @ leftover.source + 2) / (beside.sum(-1) + 3),  # as if 3 more points had 2 units in all
+        "units_around": (beside @ leftover.source + USUAL_UNITS) / (beside.sum(-1) + USUAL_COUNT),
         "scene_open": rest @ is_open / rest.sum(-1).clamp(min=1),
     }
 

@@ -28,6 +28,9 @@ from torchcrf_scan.inference.surface import Surface
 CONSIDERED = 0.1  # probability from which a mover is considered; the score alone accepts from its own threshold
 FEWEST_POINTS = 3  # a scan with fewer says nothing of the motion
 RANSAC_STARTS = 4
+RANSAC_GATE = 3.0  # units of registration error
+ASSOCIATION_GATE = 3.0  # units of footprint and noise beyond which a point has no associate
+CERTAIN = 1e-6  # probabilities are kept this far from 0 and 1
 REACH_EXTENT = 0.5  # of an object's seen extent, and
 REACH_UNITS = 4.0  # units of resolution beyond it may still be the object
 FOOTPRINT = 0.0175  # radians; spacing of a one-degree scanner on a surface that faces it
@@ -143,7 +146,7 @@ def choose(batch: ScanPairBatch, surveys: Sequence[Survey | None], score: Hypoth
         slots = slice(1, 1 + len(found.motions))
         motions[b, 0], motions[b, slots] = seen.background, found.motions
         active[b, slots] = found.probabilities >= score.threshold
-        log_odds[b, slots] = found.probabilities.logit(1e-6)
+        log_odds[b, slots] = found.probabilities.logit(CERTAIN)
         members[b, slots, : len(seen.source)] = found.members
         tangents[b, : len(seen.target)] = seen.target.tangent
     reach = within_reach(batch.source, members, resolution(batch))
@@ -153,7 +156,7 @@ def choose(batch: ScanPairBatch, surveys: Sequence[Survey | None], score: Hypoth
 def find_background(source: Surface, target: Surface, guess: Tensor, match: Tensor) -> Tensor:
     """(3,) the background's motion. guess: (3,); match: (P,) shape associations, -1 none."""
     matched = match >= 0
-    gate = 3 * unit_length(source, target)
+    gate = RANSAC_GATE * unit_length(source, target)
     ransac = ransac_motions(source.points[matched], target.points[match[matched]], gate, RANSAC_STARTS)
     return background_pool(source, target, guess, ransac)[0]
 
@@ -180,7 +183,7 @@ def within_reach(points: Tensor, members: Tensor, unit: Tensor) -> Tensor:
 
 
 def nearest_association(
-    batch: ScanPairBatch, motions: Tensor, active: Tensor, reach: Tensor | None = None, gate: float = 3.0
+    batch: ScanPairBatch, motions: Tensor, active: Tensor, reach: Tensor | None = None, gate: float = ASSOCIATION_GATE
 ) -> Tensor:
     """(B, N) target point that comes nearest under any possible motion, -1 beyond `gate` units of footprint and noise."""
     possible = possible_clusters(active, reach, batch.source.shape[1])  # (B, N, D)

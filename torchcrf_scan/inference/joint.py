@@ -82,7 +82,7 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
     is_chosen = config.movers == "threshold" or start.log_odds is None or model.chains == "matching"
     start = start if is_chosen else start.considered()
     state = first_state(view, start, parameters, config)
-    before = older = state
+    before = state
     converged = torch.zeros(len(batch), dtype=torch.bool, device=batch.source.device)
     iterations = torch.zeros(len(batch), dtype=torch.int64, device=batch.source.device)
     for done in range(config.iterations):
@@ -90,9 +90,9 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
             state = discard_vacuous(view, start, state, parameters, config)
         after = step(view, start, state, parameters, config, model.chains, model.coupling)
         if config.stop_early:
-            after = damp(after, state, older)
+            after = damp(after, state, before)
             after = keep_settled(after, state, converged)
-        older, before, state = before, state, after
+        before, state = state, after
         iterations = iterations + (~converged | (not config.stop_early)).long()
         converged = converged | has_settled(state, before, config)
         if config.stop_early and bool(converged.all()):

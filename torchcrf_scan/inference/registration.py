@@ -10,7 +10,11 @@ from torch import Tensor
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.surface import Surface
 
-ROUGHNESS = 0.1  # of the spacing: how far an ordinary surface leaves the straight line between two returns
+ROUGHNESS = 0.1  # of the spacing: how far an ordinary surface leaves the straight line between two returns,
+LONELY = 0.5  # and a return that has no neighbours
+TURN_DAMPING, SHIFT_DAMPING = 1e-4, 1e-3  # of a step, in shares of the lever's weight and of the weight
+LEAST_DAMPING = 1e-6  # of a turn about one spot, which has no lever
+LARGEST_TURN = 0.5  # radians in one step
 
 
 def nearest_points(moved: Tensor, target: Surface) -> tuple[Tensor, Tensor]:
@@ -37,7 +41,7 @@ def surface_residual(moved: Tensor, other: Surface) -> tuple[Tensor, Tensor]:
     spacing = other.spacing[index]
     saved = along**2 - (along - spacing / 2).clamp(min=0) ** 2
     is_lonely = (other.tangent[index] == 0).all(-1)
-    unit = torch.where(is_lonely, 0.5, ROUGHNESS) * spacing + 2 * other.noise
+    unit = torch.where(is_lonely, LONELY, ROUGHNESS) * spacing + 2 * other.noise
     return (distance**2 - saved).clamp(min=0).sqrt() / unit, index
 
 
@@ -67,9 +71,9 @@ def gauss_newton_step(moved: Tensor, partner: Tensor, tangent: Tensor, weights: 
     normal = torch.stack([torch.stack([(weights * dot_metric(a, b)).sum(-1) for b in basis], -1) for a in basis], -2)
     right = torch.stack([-(weights * dot_metric(a, residual)).sum(-1) for a in basis], -1)
     scale = (weights * (lever**2).sum(-1)).sum(-1)
-    damping = torch.stack([1e-4 * scale + 1e-6 * total, 1e-3 * total, 1e-3 * total], dim=-1)
+    damping = torch.stack([TURN_DAMPING * scale + LEAST_DAMPING * total, SHIFT_DAMPING * total, SHIFT_DAMPING * total], dim=-1)
     step = torch.linalg.solve(normal + torch.diag_embed(damping), right)
-    theta, shift = step[..., 0].clamp(-0.5, 0.5), step[..., 1:]
+    theta, shift = step[..., 0].clamp(-LARGEST_TURN, LARGEST_TURN), step[..., 1:]
     pivot = centre[..., 0, :]
     return torch.cat([theta[..., None], pivot - se2.rotate(theta, pivot) + shift], dim=-1)
 

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchcrf_scan.features.free_space import rising_turn
+from torchcrf_scan.features.free_space import SLACK_SHARE, SLACK_STEPS, WIDEST_GAP, rising_turn
 from torchcrf_scan.geometry import se2
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 GRAZING = math.radians(10.0)  # a surface met at a flatter angle looks like a depth jump (adaptive breakpoint detector)
+WIDEST_TURN = GRAZING * (1 - 1e-4)  # between neighbours on a surface; beams are whole steps apart, and just `GRAZING` is too far
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,7 @@ class Surface:
         turn = rising_turn(bearings.roll(-1, 0) - bearings)
         step = turn[:-1].median() if len(points) > 1 else turn.new_tensor(math.radians(0.5))
         joined = gap <= _largest_gap(torch.minimum(ranges, ranges.roll(-1, 0)), turn, noise)
-        joined &= turn < GRAZING
+        joined &= turn < WIDEST_TURN
         if not is_closed:
             joined[-1] = False
         before = joined.roll(1, 0)
@@ -126,7 +127,7 @@ class Sight:
     unmeasured: Tensor
 
 
-def look_along(moved: Tensor, scan: Surface, margin: float = 3.0) -> Sight:
+def look_along(moved: Tensor, scan: Surface, margin: float = SLACK_STEPS) -> Sight:
     """Free-space test (design finding 13) of points carried into the frame of `scan`.
 
     Args:
@@ -146,8 +147,8 @@ def look_along(moved: Tensor, scan: Surface, margin: float = 3.0) -> Sight:
     apart = torch.maximum(rising_turn(bearings - scan.bearings[left]), rising_turn(scan.bearings[right] - bearings)).minimum(
         torch.where(left == right, half_step, torch.inf)
     )
-    measured = (inside | scan.is_closed) & (apart < 2.5 * scan.step)
-    slack = margin * (scan.noise + ranges * scan.step) + 0.02 * ranges
+    measured = (inside | scan.is_closed) & (apart < WIDEST_GAP * scan.step)
+    slack = margin * (scan.noise + ranges * scan.step) + SLACK_SHARE * ranges
     near = torch.minimum(scan.ranges[left], scan.ranges[right])
     far = torch.maximum(scan.ranges[left], scan.ranges[right])
     outside = ~inside & (not scan.is_closed)

@@ -1,0 +1,168 @@
+"""The whole of decoding against the eager one."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support import all_real, generator, make_points, normal
+from torch import Tensor
+
+pytest.importorskip("numba")
+
+from torchcrf_scan import JointScanCRF
+from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.compiled import decode, kept_candidates
+from torchcrf_scan.compiled.candidates import by_motion
+from torchcrf_scan.compiled.nearest import boxes_of
+from torchcrf_scan.config import SimulatorConfig
+from torchcrf_scan.data.pair_file import read_pair
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference.initialise import Start
+
+EVERY = 9  # real pair
+CONFIGS: dict[str, dict[str, Any]] = {
+    "point": {"motion_metric": "point"},
+    "given": {"motion_metric": "given", "iterations": 3},
+    "threshold": {"movers": "threshold"},
+    "dense": {"candidates": 0, "iterations": 2},
+    "two candidates": {"candidates": 2},
+    "all rounds": {"stop_early": False, "iterations": 4},
+    "one round": {"iterations": 1},
+    "no rounds": {"iterations": 0},
+    "two clusters": {"clusters": 2},
+}
+
+
+@cache
+def layer() -> JointScanCRF:
+    return JointScanCRF.from_pretrained(backend="eager").double().requires_grad_(False)
+
+
+def with_config(**inference: Any) -> JointScanCRF:
+    model = JointScanCRF.from_pretrained(backend="eager", **inference)
+    return model.double().requires_grad_(False)
+
+
+@cache
+def simulated(seed: int, fov: float = 180.0) -> ScanPairBatch:
+    pair = simulate_pairs(SimulatorConfig(beams=121, fov=fov, movers_min=2), 1, 1, seed)[0]
+    return ScanPairBatch.collate([pair], torch.float64).without_truth()
+
+
+def compiled(model: JointScanCRF, batch: ScanPairBatch, start: Start) -> decode.Decoded:
+    pair = decode.pair_of(batch, 0)
+    begin = decode.start_of(start, 0, len(pair.source), len(pair.target))
+    return decode.decode_pair(pair, begin, decode.learned_of(model.fitted), decode.settings_of(model.config))
+
+
+def assert_same_answer(found: decode.Decoded, expected: Prediction) -> None:
+    """Labels but for ties, and everything else where they are the same."""
+    labels = torch.stack([expected.association[0], expected.cluster[0]]).numpy()
+    agree = (np.stack([found.association, found.cluster]) == labels).all(0)
+    assert agree.mean() >= 0.999
+    if not agree.all():
+        return
+    close = {"rtol": 1e-6, "atol": 1e-6}
+    for name in ("motions", "log_association", "log_cluster", "association_confidence", "cluster_confidence"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name)[0], err_msg=name, **close)
+    for name in ("active", "candidates", "converged", "iterations"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name)[0], err_msg=name)
+    assert expected.uncertainty is not None
+    spread = expected.uncertainty.covariance[0].diagonal(dim1=-2, dim2=-1).sqrt().numpy()
+    unit = spread[:, :, None] * spread[:, None, :]
+    np.testing.assert_allclose(found.covariance / unit, expected.uncertainty.covariance[0].numpy() / unit, **close)
+    np.testing.assert_allclose(found.information, expected.uncertainty.information[0], **close)
+
+
+@pytest.mark.parametrize(("seed", "fov"), [(0, 180.0), (1, 180.0), (2, 360.0), (3, 360.0)])
+def test_simulated_pairs_are_decoded_alike(seed: int, fov: float) -> None:
+    batch = simulated(seed, fov)
+    start = layer().initialise(batch)
+    assert_same_answer(compiled(layer(), batch, start), layer()(batch, start))
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_every_setting_is_decoded_alike(name: str) -> None:
+    model, batch = with_config(**CONFIGS[name]), simulated(1)
+    start = model.initialise(batch)
+    assert_same_answer(compiled(model, batch, start), model(batch, start))
+
+
+def test_metres_and_starts_without_odds_are_decoded_alike() -> None:
+    model, batch = with_config(), simulated(0)
+    model.config = replace(model.config, features=replace(model.config.features, length_unit="metre", wrap_closed=False))
+    start = replace(model.initialise(batch), reach=None, log_odds=None)
+    assert_same_answer(compiled(model, batch, start), model(batch, start))
+
+
+def test_real_pairs_are_decoded_alike(real_pairs_dir: Path) -> None:
+    for file in sorted(real_pairs_dir.glob("*.npz"))[::EVERY]:
+        batch = ScanPairBatch.collate([read_pair(file)], torch.float64).without_truth()
+        start = layer().initialise(batch)
+        assert_same_answer(compiled(layer(), batch, start), layer()(batch, start))
+
+
+def made(source: Tensor, target: Tensor, initial: Tensor) -> ScanPairBatch:
+    one, closed = torch.ones(1, dtype=torch.float64), torch.tensor([False])
+    masks = all_real(source[None]), all_real(target[None])
+    return ScanPairBatch(source[None], target[None], *masks, closed, closed, one / 10, one / 50, initial[None])
+
+
+def begin(batch: ScanPairBatch, seed: int) -> Start:
+    n, m = batch.source.shape[1], batch.target.shape[1]
+    association = torch.randint(-1, m, (1, n), generator=generator(seed))
+    tangents = torch.nn.functional.normalize(normal(1, m, 2, seed=seed), dim=-1)
+    active = torch.tensor([[True, True, False]])
+    log_odds = torch.tensor([[torch.inf, 1.0, -torch.inf]], dtype=torch.float64)
+    reach = torch.ones(1, n, 3, dtype=torch.bool)
+    return Start(0.1 * normal(1, 3, 3, seed=seed), active, association, tangents, reach, log_odds)
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 2), (3, 1), (1, 4), (12, 9)])
+def test_tiny_scans_are_decoded_alike(n: int, m: int) -> None:
+    model = with_config(clusters=4)
+    batch = made(make_points(n, 1), make_points(m, 2), 0.1 * normal(3, seed=3))
+    start = begin(batch, n + m)
+    assert_same_answer(compiled(model, batch, start), model(batch, start))
+
+
+def test_points_on_one_spot_give_numbers() -> None:
+    model = with_config(clusters=4)
+    spot = torch.tensor([[1.0, 2.0]], dtype=torch.float64).repeat(7, 1)
+    batch = made(spot, spot, torch.zeros(3, dtype=torch.float64))
+    found = compiled(model, batch, begin(batch, 1))
+    for values in (found.motions, found.covariance, found.information, found.directions, found.association_confidence):
+        assert np.isfinite(values).all()
+    assert not np.isnan(found.log_association).any()
+    assert not np.isnan(found.log_cluster).any()
+
+
+def test_nothing_that_is_given_changes() -> None:
+    batch = simulated(0)
+    pair, start = decode.pair_of(batch, 0), layer().initialise(batch)
+    first = decode.start_of(start, 0, len(pair.source), len(pair.target))
+    given = [np.copy(values) for values in (*first, pair.source, pair.target)]
+    learned, settings = decode.learned_of(layer().fitted), decode.settings_of(layer().config)
+    once, twice = (decode.decode_pair(pair, first, learned, settings) for _ in range(2))
+    for before, after in zip(given, (*first, pair.source, pair.target), strict=True):
+        np.testing.assert_array_equal(before, after)
+    for a, b in zip(once, twice, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 59, 60, 80])
+def test_kept_candidates_are_the_ones_that_a_search_finds(count: int) -> None:
+    source, target = make_points(50, 1).numpy(), make_points(60, 2).numpy()
+    boxes, motions, active = boxes_of(target), 0.1 * normal(3, 3, seed=4).numpy(), np.array([True, True, False])
+    kept = kept_candidates.kept_of(50, 60, 3, count)
+    for step in range(12):
+        motions = motions + 0.3 ** (step % 6) * 0.1 * normal(3, 3, seed=step).numpy()
+        active = np.array([True, step % 5 < 3, step > 8])
+        moved = se2.apply(torch.from_numpy(motions), torch.from_numpy(source)).numpy()
+        kept_candidates.update(kept, boxes, source, moved, motions, active)
+        np.testing.assert_array_equal(kept.index, by_motion(boxes, source, motions, active, count)[0])
