@@ -116,6 +116,7 @@ class InferenceConfig:
             the start (in the `sweep`).
         movers: `joint`: the clustering chain has its say in which hypothesised movers there are; `threshold`: their score decides
             (so in `flooding`).
+        backend: `compiled` (numba, extra `fast`: on a CPU, without gradients) or `eager`; `auto`: compiled where that is possible.
         min_extent: metres (in the unit `spacing`, those of a street scanner); a smaller cluster takes the background's rotation.
         rotation_tolerance: radians below which a motion has settled.
         translation_tolerance: metres below which a motion has settled.
@@ -132,6 +133,7 @@ class InferenceConfig:
     motion_weights: str = "hard"
     motion_metric: str = "line"
     movers: str = "joint"
+    backend: str = "auto"
     min_extent: float = 0.1
     rotation_tolerance: float = 1e-4
     translation_tolerance: float = 1e-3
@@ -142,6 +144,7 @@ class InferenceConfig:
         _choose("flooding_order", self.flooding_order, ("alternate", "ascending"))
         _choose("motion_weights", self.motion_weights, ("hard", "soft"))
         _choose("movers", self.movers, ("joint", "threshold"))
+        _choose("backend", self.backend, ("auto", "compiled", "eager"))
         _choose("motion_metric", self.motion_metric, ("point", "line", "given"))
         if self.clusters < 2:
             raise ValueError(f"clusters: expected at least 2 (background and outlier), got {self.clusters}")

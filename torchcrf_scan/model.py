@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchcrf_scan.backend import can_decode, can_search
 from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.features.potentials import Boosters, PairView
@@ -85,8 +86,9 @@ class JointScanCRF(nn.Module):
     def weight_vectors(self) -> tuple[Tensor, Tensor]:
         """(23,) and (20,): the weights in the order of `ASSOCIATION_WEIGHTS` and `CLUSTERING_WEIGHTS`, 0 for what is left out."""
         none = torch.zeros_like(self.association_weights["sequence"])
-        association = torch.stack([self.association_weights.get(n, none) for n in ASSOCIATION_WEIGHTS])
-        clustering = torch.stack([self.clustering_weights.get(n, none) for n in CLUSTERING_WEIGHTS])
+        own = dict(self.association_weights.named_parameters()), dict(self.clustering_weights.named_parameters())
+        association = torch.stack([own[0].get(name, none) for name in ASSOCIATION_WEIGHTS])
+        clustering = torch.stack([own[1].get(name, none) for name in CLUSTERING_WEIGHTS])
         live = live_weights(self.config.features)
         return association * live[0].to(association), clustering * live[1].to(clustering)
 
@@ -104,7 +106,12 @@ class JointScanCRF(nn.Module):
         clusters = self.config.inference.clusters - 1
         if self.config.chains == "matching":
             clusters = 1
-        found = initialise(batch, self.hypothesis_score, clusters)
+        if can_search(self.config.inference.backend, batch.source):
+            from torchcrf_scan.compiled import movers, pair
+
+            found = pair.initialise(batch, movers.score_of(self.hypothesis_score), clusters)
+        else:
+            found = initialise(batch, self.hypothesis_score, clusters)
         if self.config.start == "search":
             return found
         view = self.view(batch)
@@ -118,12 +125,29 @@ class JointScanCRF(nn.Module):
             batch: B pairs.
             start: motions to begin with; looked for where absent. For `ClusteringCRF` its association is the fixed one.
         """
+        if self._is_compiled(batch):
+            return self._predict_compiled(batch, start)
         start = start or self.initialise(batch)
         view = self.view(batch)
         schedule = {"sweep": joint.decode, "flooding": flooding.decode}[self.config.inference.schedule]
         prediction = schedule(view, start.scaled(view.factor), self.fitted, self.config)
         uncertainty = prediction.uncertainty and prediction.uncertainty.scaled(1 / view.factor)
         return replace(prediction, motions=scale_motions(prediction.motions, 1 / view.factor), uncertainty=uncertainty)
+
+    def _is_compiled(self, batch: ScanPairBatch) -> bool:
+        """Whether compiled code answers: there is no gradient to follow, and no scan is empty, which is left to tensors."""
+        tensors = (*self.parameters(), batch.source, batch.target, batch.initial_motion)
+        needs_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+        is_possible = can_decode(self.config, batch.source, needs_gradient=needs_gradient)
+        return is_possible and bool(batch.source_mask[:, :1].all() and batch.target_mask[:, :1].all())
+
+    def _predict_compiled(self, batch: ScanPairBatch, start: Start | None) -> Prediction:
+        from torchcrf_scan.compiled import decode, movers, pair
+
+        if start is None and self.config.start != "search":
+            start = self.initialise(batch)
+        score, learned = movers.score_of(self.hypothesis_score), decode.learned_of(self.fitted)
+        return pair.predict(batch, start, score, learned, decode.settings_of(self.config), self.config.inference.clusters)
 
     def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
         """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.

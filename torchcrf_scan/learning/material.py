@@ -9,6 +9,7 @@ import torch
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
+from torchcrf_scan.backend import can_search
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import LearningConfig
 from torchcrf_scan.inference.initialise import Start, Survey, choose, survey
@@ -108,7 +109,11 @@ def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) ->
 def _look(
     batch: ScanPairBatch, pairs: Sequence[ScanPair], seeds: Sequence[int]
 ) -> tuple[list[Survey | None], list[list[HypothesisView]]]:
-    return survey(batch), [view_pair(pair, seed) for pair, seed in zip(pairs, seeds, strict=True)]
+    if can_search("auto", batch.source):
+        from torchcrf_scan.compiled.pair import survey as look
+    else:
+        look = survey
+    return look(batch), [view_pair(pair, seed) for pair, seed in zip(pairs, seeds, strict=True)]
 
 
 def assign_folds(sequences: Sequence[str], folds: int) -> list[int]:
