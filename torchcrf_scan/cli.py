@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from jsonargparse import ArgumentParser
 
 from torchcrf_scan import __version__
+from torchcrf_scan.commands.bench import bench
 from torchcrf_scan.commands.evaluate import evaluate
 from torchcrf_scan.commands.experiment import experiment, experiment_parser
 from torchcrf_scan.commands.failures import one_line
@@ -26,6 +27,7 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
     "evaluate": evaluate,
     "experiment": experiment,
     "plot": plot,
+    "bench": bench,
 }
 
 POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: what is given, how many (one where None), meaning

@@ -1,0 +1,203 @@
+"""The report: rows as JSON, and as the tables that one looks at."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from torchcrf_scan.benchmark.machine import Rates, describe_machine
+from torchcrf_scan.benchmark.stages import STAGES, WHOLE
+from torchcrf_scan.evaluation.report import Table
+
+Row = Mapping[str, Any]
+NAN = float("nan")
+EVERYWHERE = ("stage", "mode", "batch", "beams", "threads", "median_ms_per_pair")  # keys that every row has
+
+
+def write_report(path: Path, rows: Sequence[Row], rates: Rates) -> None:
+    """`{"machine": ..., "rows": [...]}`, whole or not at all; null where there is nothing to tell."""
+    machine = {**describe_machine(), "per_second_one_thread": asdict(rates)}
+    text = json.dumps({"machine": machine, "rows": [_finite(row) for row in rows]}, indent=1, allow_nan=False) + "\n"
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(text)
+    os.replace(temporary, path)
+
+
+def _finite(row: Row) -> dict[str, Any]:
+    values = {**dict.fromkeys(EVERYWHERE), **row}
+    return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in values.items()}
+
+
+def report_tables(rows: Sequence[Row], rates: Rates) -> list[Table]:
+    """Those that have rows, in the order in which one asks."""
+    of_stage: dict[str, list[Row]] = {}
+    for row in rows:
+        of_stage.setdefault(row["stage"], []).append(row)
+    calls = [row for row in rows if row["stage"] in STAGES]
+    tables = [
+        whole_table(of_stage.get(WHOLE, [])),
+        recorded_table(of_stage.get(WHOLE, [])),
+        stages_table(calls),
+        registration_table(of_stage.get("registration", [])),
+        chain_table(of_stage.get("chain", [])),
+        growth_table(of_stage.get("growth", [])),
+        fresh_table([*of_stage.get("first_call", []), *of_stage.get("peak_memory", [])]),
+        training_table([row for row in rows if "seconds" in row]),
+        limit_table(of_stage.get("limit", []), rates),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def _number(row: Row, key: str) -> float:
+    value = row.get(key)
+    return NAN if value is None else float(value)
+
+
+def _values(rows: Iterable[Row], key: str) -> list[Any]:
+    """What occurs, in order of appearance."""
+    return list(dict.fromkeys(row[key] for row in rows))
+
+
+def _pivot(rows: Sequence[Row], keys: Sequence[str], across: str, cell: str) -> tuple[list[Any], list[tuple[Any, ...]]]:
+    """The values of `across`, and rows of the values of `keys` (as text) and a cell for each."""
+    columns = _values(rows, across)
+    found: dict[tuple[str, ...], dict[Any, float]] = {}
+    for row in rows:
+        found.setdefault(tuple(str(row[key]) for key in keys), {})[row[across]] = _number(row, cell)
+    return columns, [(*key, *(of.get(column, NAN) for column in columns)) for key, of in found.items()]
+
+
+def _sorted(rows: Sequence[Row], keys: Sequence[str]) -> list[Row]:
+    return sorted(rows, key=lambda row: tuple(row[key] for key in keys))
+
+
+def whole_table(rows: Sequence[Row]) -> Table:
+    """Simulated pairs: a column a number of beams."""
+    keys = ("backend", "mode", "batch", "threads")
+    mine = _sorted([row for row in rows if row["data"] == "simulated"], ("backend", "mode", "batch", "threads", "beams"))
+    columns, cells = _pivot(_sorted(mine, ("beams",)), keys, "beams", "median_ms_per_pair")
+    order = {tuple(str(row[key]) for key in keys): k for k, row in reversed(list(enumerate(mine)))}
+    cells.sort(key=lambda of: order[of[: len(keys)]])
+    headings = (*keys, *(f"{beams} beams" for beams in columns))
+    note = "cold: no prior motion; warm: one as odometry gives it; -: not timed, too slow (see --full, --patience)."
+    return Table("Whole pair, ms per pair", headings, tuple(cells), (*[0] * len(keys), *[2] * len(columns)), note)
+
+
+def recorded_table(rows: Sequence[Row]) -> Table:
+    """Recorded pairs, one at a time."""
+    mine = [row for row in rows if row["data"] == "recorded"]
+    cells = tuple((row["backend"], row["mode"], _number(row, "beams"), _number(row, "median_ms_per_pair")) for row in mine)
+    return Table("Recorded pairs, one at a time", ("backend", "mode", "beams", "ms per pair"), cells, (0, 0, 0, 2))
+
+
+def stages_table(rows: Sequence[Row]) -> Table:
+    """One call of every stage of a single pair: a column a number of beams, the smallest batch and number of threads."""
+    least = {key: min((row[key] for row in rows), default=0) for key in ("batch", "threads")}
+    mine = [row for row in rows if all(row[key] == value for key, value in least.items())]
+    keys = ("stage", "backend", "mode")
+    columns, cells = _pivot(_sorted(mine, ("beams",)), keys, "beams", "median_ms_per_pair")
+    calls = {tuple(str(row[key]) for key in keys): _number(row, "calls_per_pair") for row in mine}
+    order = {stage: k for k, stage in enumerate(STAGES)}
+    cells = sorted(((*of[:3], calls[of[:3]], *of[3:]) for of in cells), key=lambda of: (*of[1:3], order[of[0]]))
+    headings = (*keys, "calls per pair", *(f"{beams} beams" for beams in columns))
+    note = (
+        f"A call each, batch {least['batch']}, {least['threads']} thread(s); a pair needs as many as the fourth column says. "
+        "Compiled candidates and boosted scores as in a first round; later rounds look at what has changed alone."
+    )
+    return Table("Stages, ms per call and pair", headings, tuple(cells), (0, 0, 0, 1, *[3] * len(columns)), note)
+
+
+def _ratios(rows: Sequence[Row], suffix: str) -> list[str]:
+    return [key for key in dict.fromkeys(key for row in rows for key in row) if key.endswith(suffix)]
+
+
+def registration_table(rows: Sequence[Row]) -> Table:
+    """What others need for one rigid motion, and how many times that the whole pair takes."""
+    ratios = _ratios(rows, "_to_rival")
+    headings = ("rival", "data", "mode", "ms per pair", *(f"whole pair / rival, {key.removesuffix('_to_rival')}" for key in ratios))
+    cells = (
+        (
+            row["rival"],
+            row["data"],
+            row["mode"],
+            _number(row, "median_ms_per_pair"),
+            *(_number(row, key) for key in ratios),
+            _note(row),
+        )
+        for row in rows
+    )
+    digits = (0, 0, 0, 3, *[1] * len(ratios), 0)
+    return Table("Registration by others, on the same pairs", (*headings, "note"), tuple(cells), digits)
+
+
+def _note(row: Row) -> str:
+    return str(row.get("note") or "")
+
+
+def chain_table(rows: Sequence[Row]) -> Table:
+    """One chain: ours give the max-marginals of every node, both directions."""
+    ratios = _ratios(rows, "_to_this")
+    headings = (
+        "decoder",
+        "states",
+        "ms",
+        *(f"ours / this, {key.removesuffix('_to_this')}" for key in ratios),
+        "same labels",
+        "note",
+    )
+    same = {True: "yes", False: "no", None: "-"}
+    cells = (
+        (
+            *(row["decoder"], str(row["states"]), _number(row, "median_ms_per_pair")),
+            *(_number(row, key) for key in ratios),
+            *(same[row.get("same_labels")], _note(row)),
+        )
+        for row in rows
+    )
+    return Table("One chain of 361 nodes", headings, tuple(cells), (0, 0, 3, *[3] * len(ratios), 0, 0))
+
+
+def growth_table(rows: Sequence[Row]) -> Table:
+    """Exponent of the time over the number of beams."""
+    cells = ((row["backend"], row["mode"], row["exponent"], f"{row['from_beams']} to {row['to_beams']}") for row in rows)
+    return Table("Growth with the number of beams", ("backend", "mode", "exponent", "beams"), tuple(cells), (0, 0, 2, 0))
+
+
+def fresh_table(rows: Sequence[Row]) -> Table:
+    """First call after the import, and the peak of memory above the interpreter with torch loaded."""
+    cells = (
+        (row["backend"], row["stage"], str(row["batch"]), _number(row, "median_ms_per_pair"), _number(row, "megabytes"))
+        for row in rows
+    )
+    return Table("In a fresh process", ("backend", "what", "batch", "ms", "MB"), tuple(cells), (0, 0, 0, 0, 0))
+
+
+def training_table(rows: Sequence[Row]) -> Table:
+    """Seconds of learning."""
+    cells = ((row["stage"], _number(row, "seconds"), str(row["pairs"]), _note(row)) for row in rows)
+    return Table("Training", ("what", "s", "pairs", "note"), tuple(cells), (0, 1, 0, 0))
+
+
+def limit_table(rows: Sequence[Row], rates: Rates) -> Table:
+    """How far from what the machine could do."""
+    backends = [key.removesuffix("_to_limit") for key in _ratios(rows, "_to_limit")]
+    columns = (f"{name}{end}" for name in backends for end in (", ms", " / limit"))
+    headings = ("stage", "mode", "operations (M)", "bytes (MB)", "limit, ms", *columns)
+    cells = (
+        (
+            *(row["of"], row["mode"], row["operations"] / 1e6, row["bytes"] / 1e6, row["limit_ms_per_pair"]),
+            *(_number(row, f"{name}{end}") for name in backends for end in ("_ms_per_pair", "_to_limit")),
+        )
+        for row in rows
+    )
+    note = (
+        f"All calls of a pair. One thread: {rates.bandwidth / 1e9:.1f} GB/s, {rates.matrix / 1e9:.1f} G operations/s in a matrix "
+        f"product (the limit), {rates.vector / 1e9:.1f} G/s in short vectors. Counted in benchmark/limits.py."
+    )
+    digits = (0, 0, 2, 2, 4, *[2, 0] * len(backends))
+    return Table("How far from the limit", headings, tuple(cells), digits, note)

@@ -1,0 +1,73 @@
+"""What learning costs: one fold of the experiment, all folds, and a pass over a thousand pairs."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import torch
+
+from torchcrf_scan.benchmark.timing import threads_kept
+from torchcrf_scan.config import LearningConfig, ModelConfig
+from torchcrf_scan.learning.calibration_fit import calibrate
+from torchcrf_scan.learning.cross_validation import cores
+from torchcrf_scan.learning.fit import fit
+from torchcrf_scan.learning.material import collect
+from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.scan import ScanPair
+
+T = TypeVar("T")
+FOLDS = 31
+PASS = 1000
+
+
+def time_training(pairs: Sequence[ScanPair], config: ModelConfig, learning: LearningConfig) -> list[dict[str, Any]]:
+    """Rows of `stage`, `seconds` and `pairs`, on one thread, as folds run; each part is timed once.
+
+    Looking at a pair is done once for all folds; a fold fits the movers' score, scales, boosters, weights, the movers' worth and
+    the confidences. A training pass is the pseudo-likelihood and its gradient. The rows of all folds and of the pass are scaled.
+    """
+    with threads_kept():
+        torch.set_num_threads(1)
+        return _rows(pairs, config, learning)
+
+
+def _rows(pairs: Sequence[ScanPair], config: ModelConfig, learning: LearningConfig) -> list[dict[str, Any]]:
+    collection, looking = _timed(lambda: collect(pairs, learning))
+
+    def fit_fold() -> JointScanCRF:
+        everything = range(len(collection))
+        model = JointScanCRF(config)
+        model.hypothesis_score = collection.fit_score(everything)
+        material = collection.material(everything, model.hypothesis_score, config.inference.clusters - 1, learning)
+        fit(model, material, learning)
+        calibrate(model, material)
+        return model
+
+    model, fold = _timed(fit_fold)
+    size = learning.batch_size
+    parts = [collection.batch[begin : begin + size] for begin in range(0, len(pairs), size)]
+
+    def look_once() -> None:
+        for part in parts:
+            (-model.pseudo_log_likelihood(part).sum()).backward()
+
+    _, once = _timed(look_once)
+    per_pair, count = looking / len(pairs), len(pairs)
+    everywhere = per_pair * FOLDS / cores(0) + math.ceil(FOLDS / cores(0)) * fold
+    projected = f"projected from fit_fold on {count} pairs: {FOLDS} folds on {cores(0)} cores, without baselines and tables"
+    rows = [
+        ("look_at_pair", per_pair, 1, "InitialiseRT and the views of the movers' score"),
+        ("fit_fold", fold, count, "without looking at the pairs, which all folds share"),
+        (f"leave_one_out_{FOLDS}", everywhere, FOLDS, projected),
+        (f"training_pass_{PASS}", once * PASS / count, PASS, f"pseudo-likelihood and its gradient, scaled from {count} pairs"),
+    ]
+    return [dict(zip(("stage", "seconds", "pairs", "note"), row, strict=True), threads=1) for row in rows]
+
+
+def _timed(run: Callable[[], T]) -> tuple[T, float]:
+    began = time.perf_counter()
+    made = run()
+    return made, time.perf_counter() - began

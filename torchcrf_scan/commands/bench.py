@@ -1,0 +1,75 @@
+"""`torchcrf-scan bench`: what the model costs, beside rivals and beside what the machine could do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torchcrf_scan.commands.arguments import make_folder
+from torchcrf_scan.model import PRETRAINED
+
+
+def bench(
+    output: str,
+    *,
+    model: str = PRETRAINED,
+    pairs: tuple[str, ...] | str = (),
+    backends: tuple[str, ...] = (),
+    beams: tuple[int, ...] = (181, 361, 721, 1441, 2881),
+    batches: tuple[int, ...] = (1, 8, 32),
+    threads: tuple[int, ...] = (1, 2),
+    repeats: int = 3,
+    simulated: int = 8,
+    training_pairs: int = 30,
+    patience: float = 15.0,
+    full: bool = False,
+) -> int:
+    """Times the whole pair and its stages, learning and rivals, measures memory, and says how far from the limit all this is.
+
+    Everything is timed in turns and given as medians, on simulated streets, cold (no prior motion) and warm (the true one, as
+    wrong as odometry). Rivals that are installed run in the same turns (`pip install torchcrf-scan[bench]`). Tables are
+    printed, all rows are written.
+
+    Args:
+        output: JSON file of the report
+        model: folder of a saved model, or the name of one that the package ships
+        pairs: annotated pair files, folders or glob patterns, to time recorded pairs as well
+        backends: compiled, eager; all that run here where absent
+        beams: numbers of beams, as a list [181,361]
+        batches: numbers of pairs at once
+        threads: numbers of threads of torch
+        repeats: times that every pair is timed, if three seconds are enough for that
+        simulated: simulated pairs of every number of beams
+        training_pairs: pairs that one fold is fitted on, 0: no learning
+        patience: seconds of a call from which on it is left out
+        full: the reference (eager) in all sizes too, else in those that differ in one thing alone
+    """
+    from torchcrf_scan.benchmark.backends import choose_backends
+    from torchcrf_scan.benchmark.machine import measure_rates
+    from torchcrf_scan.benchmark.plan import Plan
+    from torchcrf_scan.benchmark.report import report_tables, write_report
+    from torchcrf_scan.benchmark.scenes import street_pairs
+    from torchcrf_scan.benchmark.study import run_study
+    from torchcrf_scan.config import LearningConfig, ModelConfig
+    from torchcrf_scan.data.dataset import PairFiles
+
+    for name, values in {"beams": beams, "batches": batches, "threads": threads}.items():
+        if not values or min(values) < 1:
+            raise ValueError(f"--{name}: expected numbers of at least 1, got {list(values)}")
+    for name, value in {"repeats": repeats, "simulated": simulated}.items():
+        if value < 1:
+            raise ValueError(f"--{name}: expected at least 1, got {value}")
+    path = Path(output)
+    make_folder("--output", path.parent)
+    patterns = (pairs,) if isinstance(pairs, str) else pairs
+    recorded = tuple(PairFiles(*patterns)) if patterns else ()
+    plan = Plan(model, choose_backends(backends), beams, batches, threads, repeats, simulated, patience, recorded, full)
+    rates = measure_rates()
+    rows = run_study(plan, rates)
+    if training_pairs:
+        from torchcrf_scan.benchmark.training import time_training
+
+        rows += time_training(street_pairs(plan.centre[1], training_pairs), ModelConfig(), LearningConfig())
+    write_report(path, rows, rates)
+    print("\n".join(table.to_markdown() for table in report_tables(rows, rates)), end="")
+    print(f"\nall rows: {output}")
+    return 0
