@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.util import find_spec
+from importlib import import_module
 
 import numpy as np
 
@@ -46,8 +46,16 @@ LIBRARIES: dict[str, tuple[str, Callable[[ScanPair], PairPrediction]]] = {
 
 
 def installed_libraries() -> dict[str, Callable[[ScanPair], PairPrediction]]:
-    """Row name -> method, of the libraries that can be imported here."""
-    return {row: match for row, (module, match) in LIBRARIES.items() if find_spec(module) is not None}
+    """Row name -> method, of the libraries that can be imported here; one that is installed may still lack what it needs."""
+    return {row: match for row, (module, match) in LIBRARIES.items() if _can_import(module)}
+
+
+def _can_import(module: str) -> bool:
+    try:
+        import_module(module)
+    except ImportError:
+        return False
+    return True
 
 
 def planar_motion(transform: Floats) -> Floats:
