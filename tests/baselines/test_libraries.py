@@ -54,7 +54,11 @@ def test_planar_motion_of_a_transform() -> None:
 
 
 def test_only_what_can_be_imported_is_offered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(libraries, "find_spec", lambda module: object() if module == "small_gicp" else None)
+    def find(module: str) -> None:
+        if module != "small_gicp":
+            raise ModuleNotFoundError(module)
+
+    monkeypatch.setattr(libraries, "import_module", find)
     assert installed_libraries() == {"small_gicp (ICP)": match_small_gicp}
 
 
