@@ -8,7 +8,8 @@ pytest.importorskip("numba")
 from surveyed import PAIRS, REAL, SCENES, survey
 
 from torchcrf_scan.compiled.groups import ends
-from torchcrf_scan.compiled.hypotheses import nearest_within, residual_units
+from torchcrf_scan.compiled.hypotheses import residual_units
+from torchcrf_scan.compiled.nearest import nearest_within
 from torchcrf_scan.compiled.surface import OCCLUDED, SEEN_THROUGH, UNMEASURED
 from torchcrf_scan.inference import hypotheses as eager
 from torchcrf_scan.inference.background import unit_length

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from torchcrf_scan.compiled.jit import Array, Booleans, Integers, kernel
-from torchcrf_scan.compiled.nearest import RUN, Boxes, box_distance
+from torchcrf_scan.compiled.nearest import RUN, Boxes, box_distance, nearest
 
 
 @kernel
@@ -27,26 +27,6 @@ def under_motions(source: Array, motions: Array, active: Booleans) -> tuple[Arra
             moved[a, i, 0] = cos * x - sin * y + motion[1]
             moved[a, i, 1] = sin * x + cos * y + motion[2]
     return moved, which[:A]
-
-
-@kernel
-def first_nearest(boxes: Boxes, x: float, y: float, guess: int) -> tuple[float, int]:
-    """`nearest.nearest`, but of points at the same distance the first, whatever the guess."""
-    points, small, large = boxes
-    dx, dy = points[guess, 0] - x, points[guess, 1] - y
-    least, index = dx * dx + dy * dy, guess
-    for c in range(len(large)):
-        if box_distance(large[c], x, y) > least:
-            continue
-        for b in range(c * RUN, min(len(small), (c + 1) * RUN)):
-            if box_distance(small[b], x, y) > least:
-                continue
-            for j in range(b * RUN, min(len(points), (b + 1) * RUN)):
-                dx, dy = points[j, 0] - x, points[j, 1] - y
-                squared = dx * dx + dy * dy
-                if squared < least or (squared == least and j < index):
-                    least, index = squared, j
-    return least, index
 
 
 @kernel
@@ -78,8 +58,8 @@ def _improve(boxes: Boxes, moved: Array, i: int, member: Integers, squared: Arra
     points, small, large = boxes
     last = len(index) - 1
     for a in range(len(moved)):
-        x, y, nearest = moved[a, i, 0], moved[a, i, 1], guess[a]
-        least = (points[nearest, 0] - x) ** 2 + (points[nearest, 1] - y) ** 2
+        x, y, closest = moved[a, i, 0], moved[a, i, 1], guess[a]
+        least = (points[closest, 0] - x) ** 2 + (points[closest, 1] - y) ** 2
         reach = max(squared[last], least)
         for c in range(len(large)):
             if box_distance(large[c], x, y) > reach:
@@ -92,8 +72,8 @@ def _improve(boxes: Boxes, moved: Array, i: int, member: Integers, squared: Arra
                     distance = dx * dx + dy * dy
                     if distance > reach:
                         continue
-                    if distance < least or (distance == least and j < nearest):
-                        least, nearest = distance, j
+                    if distance < least or (distance == least and j < closest):
+                        least, closest = distance, j
                     if distance <= squared[last] and member[j] != i:
                         of_any = _least_distance(moved, i, points[j, 0], points[j, 1])
                         if of_any < squared[last] or (of_any == squared[last] and j < index[last]):
@@ -101,7 +81,7 @@ def _improve(boxes: Boxes, moved: Array, i: int, member: Integers, squared: Arra
                             _insert(of_any, j, last, squared, index)
                             member[j] = i
                     reach = max(squared[last], least)
-        guess[a] = nearest
+        guess[a] = closest
 
 
 @kernel
@@ -118,15 +98,15 @@ def sort_in_place(index: Integers) -> None:
 @kernel
 def nearest_under(boxes: Boxes, moved: Array, which: Integers, C: int) -> Integers:
     """(N, C) nearest target point under every active motion; 0 under the others. moved: (A, N, 2); which: (A,)."""
-    nearest = np.zeros((moved.shape[1], C), np.int64)
+    index = np.zeros((moved.shape[1], C), np.int64)
     M = len(boxes.points)
     for a in range(len(which) if M > 0 else 0):
         guess = 0
         for i in range(moved.shape[1]):
-            _, guess = first_nearest(boxes, moved[a, i, 0], moved[a, i, 1], guess)
-            nearest[i, which[a]] = guess
+            _, guess = nearest(boxes, moved[a, i, 0], moved[a, i, 1], guess)
+            index[i, which[a]] = guess
             guess = min(guess + 1, M - 1)
-    return nearest
+    return index
 
 
 @kernel
@@ -149,7 +129,7 @@ def by_motion(boxes: Boxes, source: Array, motions: Array, active: Booleans, cou
     if is_dense or A == 0:
         index[:] = np.arange(K)
         return index, mask, nearest_under(boxes, moved, which, len(active))
-    nearest, guess = np.zeros((N, len(active)), np.int64), np.zeros(A, np.int64)
+    closest, guess = np.zeros((N, len(active)), np.int64), np.zeros(A, np.int64)
     squared, member = np.empty(K), np.full(M, -1)
     for i in range(N):  # the candidates of the point before, or those after them, are a good guess at the list
         step = 1 if i > 0 and index[i - 1, K - 1] < M - 1 else 0
@@ -160,9 +140,9 @@ def by_motion(boxes: Boxes, source: Array, motions: Array, active: Booleans, cou
         _improve(boxes, moved, i, member, squared, index[i], guess)
         sort_in_place(index[i])
         for a in range(A):
-            nearest[i, which[a]] = guess[a]
+            closest[i, which[a]] = guess[a]
             guess[a] = min(guess[a] + 1, M - 1)
-    return index, mask, nearest
+    return index, mask, closest
 
 
 @kernel

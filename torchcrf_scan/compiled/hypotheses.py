@@ -15,7 +15,7 @@ from torchcrf_scan.compiled.field import Field
 from torchcrf_scan.compiled.groups import Groups, ends, groups_of
 from torchcrf_scan.compiled.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.compiled.leftover import Leftover
-from torchcrf_scan.compiled.nearest import RUN, Boxes, box_distance
+from torchcrf_scan.compiled.nearest import Boxes, nearest_within
 from torchcrf_scan.compiled.registration import register
 from torchcrf_scan.inference.hypotheses import (
     FARTHEST,
@@ -200,30 +200,6 @@ def residual_units(boxes: Boxes, units: Array, farthest: float, x: float, y: flo
     """
     squared, index = nearest_within(boxes, x, y, guess, farthest * farthest)
     return (min(math.sqrt(squared) / units[index], TRUNCATION) if index >= 0 else TRUNCATION), index
-
-
-@kernel
-def nearest_within(boxes: Boxes, x: float, y: float, guess: int, least: float) -> tuple[float, int]:
-    """Squared distance to and index of the nearest point that is nearer than the root of `least`, -1 where there is none."""
-    points, small, large = boxes
-    index = -1
-    if guess >= 0:
-        dx, dy = points[guess, 0] - x, points[guess, 1] - y
-        squared = dx * dx + dy * dy
-        if squared < least:
-            least, index = squared, guess
-    for c in range(len(large)):
-        if box_distance(large[c], x, y) >= least:
-            continue
-        for b in range(c * RUN, min(len(small), (c + 1) * RUN)):
-            if box_distance(small[b], x, y) >= least:
-                continue
-            for j in range(b * RUN, min(len(points), (b + 1) * RUN)):
-                dx, dy = points[j, 0] - x, points[j, 1] - y
-                squared = dx * dx + dy * dy
-                if squared < least:
-                    least, index = squared, j
-    return least, index
 
 
 # --- registration -------------------------------------------------------------------------------------------------------------

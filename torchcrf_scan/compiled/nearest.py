@@ -5,12 +5,11 @@ Neighbouring beams mostly meet the same surface, so that their order is as good 
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.compiled.jit import Array, Integers, kernel
+from torchcrf_scan.compiled.jit import Array, kernel
 
 RUN = 8  # points in a box, and boxes in a large box
 
@@ -56,32 +55,33 @@ def box_distance(box: Array, x: float, y: float) -> float:
 
 
 @kernel
-def nearest(boxes: Boxes, x: float, y: float, guess: int) -> tuple[float, int]:
-    """Squared distance to and index of the nearest point; `guess` is looked at first, and right guesses make it fast."""
+def nearest_within(boxes: Boxes, x: float, y: float, guess: int, least: float) -> tuple[float, int]:
+    """Squared distance to and index of the nearest point that is nearer than the root of `least`, -1 where there is none.
+
+    Of points at the same distance the first. `guess` is looked at before all others, -1: none; right guesses make it fast.
+    """
     points, small, large = boxes
-    dx, dy = points[guess, 0] - x, points[guess, 1] - y
-    least, index = dx * dx + dy * dy, guess
+    index = -1
+    if guess >= 0:
+        dx, dy = points[guess, 0] - x, points[guess, 1] - y
+        squared = dx * dx + dy * dy
+        if squared < least:
+            least, index = squared, guess
     for c in range(len(large)):
-        if box_distance(large[c], x, y) >= least:
+        if box_distance(large[c], x, y) > least:
             continue
         for b in range(c * RUN, min(len(small), (c + 1) * RUN)):
-            if box_distance(small[b], x, y) >= least:
+            if box_distance(small[b], x, y) > least:
                 continue
             for j in range(b * RUN, min(len(points), (b + 1) * RUN)):
                 dx, dy = points[j, 0] - x, points[j, 1] - y
                 squared = dx * dx + dy * dy
-                if squared < least:
+                if squared < least or (squared == least and j < index):
                     least, index = squared, j
     return least, index
 
 
 @kernel
-def nearest_points(boxes: Boxes, moved: Array) -> tuple[Array, Integers]:
-    """(P,) metres to and (P,) index of the nearest point of (P, 2) points in beam order."""
-    distance, index = np.empty(len(moved)), np.empty(len(moved), np.int64)
-    guess = 0
-    for i in range(len(moved)):
-        squared, guess = nearest(boxes, moved[i, 0], moved[i, 1], guess)
-        distance[i], index[i] = math.sqrt(squared), guess
-        guess = min(guess + 1, len(boxes.points) - 1)
-    return distance, index
+def nearest(boxes: Boxes, x: float, y: float, guess: int) -> tuple[float, int]:
+    """`nearest_within` any distance."""
+    return nearest_within(boxes, x, y, guess, np.inf)

@@ -1,4 +1,4 @@
-"""From two scans to the start of the labelling in one call: every kernel called from outside costs time to load and to call."""
+"""From two scans to the start of the labelling, step by step."""
 
 from __future__ import annotations
 
