@@ -80,8 +80,10 @@ class Collection:
         return material
 
 
-def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) -> Collection:
+def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1, backend: str = "auto") -> Collection:
     """Looks at the pairs, on `jobs` cores (-1: all); what is drawn at random for a pair does not depend on `jobs`.
+
+    backend: what searches for motions, see `InferenceConfig`.
 
     Raises:
         ValueError: a pair without annotation, or no pair.
@@ -94,7 +96,7 @@ def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) ->
         batch = disturb(batch, config.disturbance, torch.Generator().manual_seed(config.seed))
     parts = [range(k, min(k + PART, len(pairs))) for k in range(0, len(pairs), PART)]
     tasks = (
-        delayed(_look)(batch.select(torch.tensor(part)), [pairs[k] for k in part], [config.seed + k for k in part])
+        delayed(_look)(batch.select(torch.tensor(part)), [pairs[k] for k in part], [config.seed + k for k in part], backend)
         for part in parts
     )
     found = Parallel(n_jobs=jobs, return_as="generator")(tasks)
@@ -107,9 +109,9 @@ def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) ->
 
 
 def _look(
-    batch: ScanPairBatch, pairs: Sequence[ScanPair], seeds: Sequence[int]
+    batch: ScanPairBatch, pairs: Sequence[ScanPair], seeds: Sequence[int], backend: str
 ) -> tuple[list[Survey | None], list[list[HypothesisView]]]:
-    if can_search("auto", batch.source):
+    if can_search(backend, batch.source):
         from torchcrf_scan.compiled.pair import survey as look
     else:
         look = survey

@@ -60,7 +60,7 @@ class Study:
     @classmethod
     def of(cls, pairs: Sequence[ScanPair], config: Config, jobs: int) -> Study:
         """Looks at the pairs, on `jobs` cores. Raises ValueError for pairs without annotation."""
-        collection = collect(pairs, config.learning, jobs)
+        collection = collect(pairs, config.learning, jobs, config.model.inference.backend)
         if config.experiment.joint_alone:
             return cls(tuple(pairs), collection, np.zeros((len(pairs), len(GATES))))
         shares = Parallel(n_jobs=jobs)(delayed(found_shares)(pair, GATES) for pair in pairs)

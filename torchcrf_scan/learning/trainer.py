@@ -53,7 +53,7 @@ def train(config: Config) -> dict[str, list[PairScore]]:
     began = time.perf_counter()
     with RunLog(folder) as run:
         model = JointScanCRF(config.model)
-        collection = collect(train_pairs, config.learning, jobs=-1)
+        collection = collect(train_pairs, config.learning, jobs=-1, backend=config.model.inference.backend)
         everything = range(len(collection))
         model.hypothesis_score = collection.fit_score(everything)
         clusters = config.model.inference.clusters - 1
