@@ -8,6 +8,7 @@ are bool, True = real; logarithms are named `log_*`. Frame: x ahead, y left, met
 
 from torchcrf_scan.batch import Prediction, ScanPairBatch
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.features.learned import ExtraLogUnary
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
 
@@ -16,6 +17,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Annotation",
     "ClusteringCRF",
+    "ExtraLogUnary",
     "FeatureConfig",
     "InferenceConfig",
     "JointScanCRF",

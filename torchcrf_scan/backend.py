@@ -35,14 +35,21 @@ def can_search(backend: str, points: Tensor) -> bool:
     return _decide(backend, _why_not_here(points))
 
 
-def can_decode(model: ModelConfig, points: Tensor, *, needs_gradient: bool) -> bool:
-    """Whether compiled code decodes a model; arguments and errors as in `can_search`."""
+def can_decode(model: ModelConfig, points: Tensor, *, needs_gradient: bool, has_learned_inputs: bool = False) -> bool:
+    """Whether compiled code decodes a model; arguments and errors as in `can_search`.
+
+    has_learned_inputs: embeddings or extra log potentials were given.
+    """
     inference = model.inference
     chosen = {name: getattr(inference if hasattr(inference, name) else model, name) for name in COMPILED_SETTINGS}
     unknown = [f"{name}: {chosen[name]}" for name, known in COMPILED_SETTINGS.items() if chosen[name] not in known]
     reason = _why_not_here(points)
+    if model.features.smooth > 0:
+        unknown.append(f"smooth: {model.features.smooth}")
     if unknown:
         reason = f"settings that it knows, got {', '.join(unknown)}"
+    elif has_learned_inputs:
+        reason = "scans alone, got embeddings or extra_log_unary (backend eager or auto takes them)"
     elif needs_gradient:
         reason = "no gradient to be asked for (torch.no_grad)"
     return _decide(inference.backend, reason)

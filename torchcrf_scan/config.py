@@ -97,6 +97,12 @@ def _choose(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value}")
 
 
+def _within(name: str, value: float, least: float, most: float) -> None:
+    if not least <= value <= most:  # NaN is not
+        expected = f"{least} or more" if most == math.inf else f"a number in [{least}, {most:g}]"
+        raise ValueError(f"{name}: expected {expected}, got {value}")
+
+
 @dataclass(frozen=True)
 class InferenceConfig:
     """How the model is decoded (spec 7).
@@ -116,6 +122,7 @@ class InferenceConfig:
             the start (in the `sweep`).
         movers: `joint`: the clustering chain has its say in which hypothesised movers there are; `threshold`: their score decides
             (so in `flooding`).
+        detach_motion: no gradient passes through a motion into the features of the next pass; motions keep their own.
         backend: `compiled` (numba, extra `fast`: on a CPU, without gradients) or `eager`; `auto`: compiled where that is possible.
         min_extent: metres (in the unit `spacing`, those of a street scanner); a smaller cluster takes the background's rotation.
         rotation_tolerance: radians below which a motion has settled.
@@ -133,6 +140,7 @@ class InferenceConfig:
     motion_weights: str = "hard"
     motion_metric: str = "line"
     movers: str = "joint"
+    detach_motion: bool = False
     backend: str = "auto"
     min_extent: float = 0.1
     rotation_tolerance: float = 1e-4
@@ -167,6 +175,12 @@ class FeatureConfig:
         free_space: what beams see through and what hides from them, as extension weights of both chains (design finding 13).
         decisions: what parts inliers from outliers and the nearest target point from others, as extension weights of both chains:
             a gate on the residual, a constant, the lead of the nearest. This and `free_space` off: the paper's 30.
+        smooth: width of the stumps' sigmoids, in units of the boosted features (robust squares, 0 to -9); 0: steps. As the width
+            goes to 0 the margins become those of the steps that were fitted; a tenth changes hardly an answer. Above 0, gradients
+            reach points and motions through them.
+        learn_stumps: thresholds and tables of the boosters are parameters, learned with the weights; needs `smooth` above 0.
+        embedding: `dot` (scaled dot product) or `cosine`: the similarity of embeddings given to `forward` scores associations
+            (`features.learned`), with two named weights more; or `none`.
         left_out: features that the model does without, as `association.NAME` or `clustering.NAME` of a weight; a local channel is
             then hidden from the boosters too. By default the two that compare an edge's length, which call sparsely sampled
             surfaces outliers, and the decisions of the clustering chain, which cost it movers.
@@ -178,12 +192,20 @@ class FeatureConfig:
     stumps: int = 50
     free_space: bool = True
     decisions: bool = True
+    smooth: float = 0.0
+    learn_stumps: bool = False
+    embedding: str = "none"
     left_out: tuple[str, ...] = LEFT_OUT
 
     def __post_init__(self) -> None:
         for name in self.left_out:
             _choose("left_out", name, WEIGHTS)
         _choose("length_unit", self.length_unit, ("spacing", "metre"))
+        _choose("embedding", self.embedding, ("none", "dot", "cosine"))
+        if not 0 <= self.smooth < math.inf:
+            raise ValueError(f"smooth: expected a finite width of 0 or more, got {self.smooth}")
+        if self.learn_stumps and self.smooth == 0:
+            raise ValueError("learn_stumps: expected smooth above 0 (steps have no gradient), got smooth 0")
 
 
 @dataclass(frozen=True)
@@ -214,6 +236,47 @@ class ModelConfig:
 
 
 @dataclass(frozen=True)
+class UnrolledConfig:
+    """The objective `unrolled`: losses on soft read-outs after a fixed number of rounds, at inferred motions.
+
+    Attributes:
+        iterations: rounds, always all of them.
+        temperature: of the read-out: log-beliefs (max-marginals, where `inference.temperature` is 0) are divided by it.
+        association: weight of the associations' cross-entropy.
+        cluster: weight of the clusters' cross-entropy.
+        rotation: weight of the motions' robust geodesic loss.
+        translation: weight of the motions' robust loss of where a cluster's centroid lands.
+        rotation_scale: radians; smaller errors count squared, larger ones by their logarithm.
+        translation_scale: metres (in the unit `spacing`, those of a street scanner), likewise.
+        detach_motion: no gradient passes through a motion into the features of the next pass.
+        deep_supervision: earlier rounds count too, each by this factor less than the next; 0: the last alone, 1: all alike.
+    """
+
+    iterations: int = 4
+    temperature: float = 1.0
+    association: float = 1.0
+    cluster: float = 1.0
+    rotation: float = 0.2
+    translation: float = 0.2
+    rotation_scale: float = 0.02
+    translation_scale: float = 0.1
+    detach_motion: bool = False
+    deep_supervision: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"iterations: expected at least 1, got {self.iterations}")
+        for name in ("temperature", "rotation_scale", "translation_scale"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite number above 0, got {getattr(self, name)}")
+        for name in ("association", "cluster", "rotation", "translation"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite weight of 0 or more, got {getattr(self, name)}")
+        if not 0 <= self.deep_supervision <= 1:
+            raise ValueError(f"deep_supervision: expected a factor between 0 and 1, got {self.deep_supervision}")
+
+
+@dataclass(frozen=True)
 class LearningConfig:
     """How the model is learned (spec 2, 6).
 
@@ -221,7 +284,8 @@ class LearningConfig:
         rotation_noise: radians of noise on the true motions.
         translation_noise: metres of noise on the true motions.
         objective: `pseudo_likelihood` (the paper's), or `likelihood`: the exact likelihood of each chain, without the former's
-            over-strong pairwise weights (spec 6.5).
+            over-strong pairwise weights (spec 6.5); or `unrolled`: from the weights of pseudo-likelihood on through the unrolled
+            iterations, step by step (`gradient`).
         disturbance: units of resolution by which training scans are skewed and bumped, as moving sensors do; 0: as they are.
         start_share: share of the pairs whose features see InitialiseRT's motions instead.
         predicted_share: share of the pairs whose clustering features see predicted associations (A-28). 0, the true ones, for
@@ -253,7 +317,108 @@ class LearningConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _choose("objective", self.objective, ("pseudo_likelihood", "likelihood"))
+        _choose("objective", self.objective, ("pseudo_likelihood", "likelihood", "unrolled"))
+
+
+@dataclass(frozen=True)
+class AugmentConfig:
+    """How training pairs are varied as they are generated; 0 leaves a pair as it is.
+
+    Attributes:
+        mirror: share of the pairs that are mirrored, left for right.
+        dropout: largest share of the returns of a scan that are lost.
+        noise: largest noise that is added to the returns, in units of the sensor's own.
+        frame_rotation: radians by which the target's frame is turned, at most.
+        frame_translation: how far the target's frame is moved along x and y, at most; in units of the usual range of the target.
+    """
+
+    mirror: float = 0.5
+    dropout: float = 0.1
+    noise: float = 1.0
+    frame_rotation: float = 0.05
+    frame_translation: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name, most in (("mirror", 1.0), ("dropout", 0.9), ("noise", math.inf), ("frame_rotation", math.pi)):
+            _within(f"gradient.augment.{name}", getattr(self, name), 0.0, most)
+        _within("gradient.augment.frame_translation", self.frame_translation, 0.0, math.inf)
+
+    @classmethod
+    def nothing(cls) -> AugmentConfig:
+        """Pairs stay as they are."""
+        return cls(mirror=0.0, dropout=0.0, noise=0.0, frame_rotation=0.0, frame_translation=0.0)
+
+
+@dataclass(frozen=True)
+class GradientConfig:
+    """First-order training, which goes on from the staged fit or from `init`: AdamW on pairs that are generated on the fly.
+
+    Attributes:
+        objective: loss of the steps: `pseudo_likelihood` or `unrolled`; `none`: no steps, the staged fit is all. With
+            `learning.objective` unrolled it is `unrolled`.
+        steps: optimiser's steps at most.
+        batch_size: pairs of a step, of all processes together.
+        part: pairs that are looked at at once; a step's parts are shared out among the processes. Divides `batch_size`.
+        workers: processes that generate pairs, of every training process; 0: none beside it.
+        learning_rate: at its highest.
+        weight_decay: of AdamW.
+        warmup: steps until the learning rate is at its highest; after that it falls along a cosine.
+        final_rate: share of the highest learning rate that is left in the end.
+        clip: norm that gradients are cut to; 0: never.
+        amp: bfloat16 where the device is a GPU that has it (torch.autocast); a CPU always calculates in full precision.
+        device: `auto` (a GPU where there is one), `cpu` or `cuda`.
+        worlds: names of the simulated `WORLDS` that pairs are drawn from.
+        fresh: share of the pairs that are simulated on the fly; the others are drawn from the training pairs.
+        validation: share of the training pairs, in whole sequences, that nothing is fitted on; 0: no validation, and the last
+            weights are kept instead of the best.
+        validate_every: steps between two looks at the validation pairs.
+        patience: looks without a better loss after which training stops early; 0: never.
+        checkpoint_every: steps between two checkpoints.
+        graph: draw the module's graph in TensorBoard, which takes some seconds.
+        seed: of everything drawn: pair k of a run is a function of (seed, k) alone.
+    """
+
+    objective: str = "none"
+    steps: int = 200
+    batch_size: int = 8
+    part: int = 4
+    workers: int = 1
+    learning_rate: float = 0.01
+    weight_decay: float = 0.0
+    warmup: int = 10
+    final_rate: float = 0.05
+    clip: float = 1.0
+    amp: bool = False
+    device: str = "auto"
+    worlds: tuple[str, ...] = ("street",)
+    fresh: float = 1.0
+    validation: float = 0.25
+    validate_every: int = 20
+    patience: int = 5
+    checkpoint_every: int = 20
+    graph: bool = True
+    seed: int = 0
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+
+    def __post_init__(self) -> None:
+        _choose("gradient.objective", self.objective, ("none", "pseudo_likelihood", "unrolled"))
+        _choose("gradient.device", self.device, ("auto", "cpu", "cuda"))
+        for world in self.worlds:
+            _choose("gradient.worlds", world, tuple(WORLDS))
+        for name in ("steps", "batch_size", "part", "validate_every", "checkpoint_every"):
+            _within(f"gradient.{name}", getattr(self, name), 1, math.inf)
+        for name in ("workers", "weight_decay", "warmup", "clip", "patience", "seed"):
+            _within(f"gradient.{name}", getattr(self, name), 0, math.inf)
+        for name in ("final_rate", "fresh"):
+            _within(f"gradient.{name}", getattr(self, name), 0.0, 1.0)
+        if not 0 < self.learning_rate < math.inf:
+            raise ValueError(f"gradient.learning_rate: expected more than 0, got {self.learning_rate}")
+        if not 0 <= self.validation < 1:
+            raise ValueError(f"gradient.validation: expected a share in [0, 1), got {self.validation}")
+        if self.batch_size % self.part:
+            raise ValueError(f"gradient.part: expected a divisor of batch_size = {self.batch_size}, got {self.part}")
+        if self.fresh > 0 and not self.worlds:
+            raise ValueError(f"gradient.worlds: expected at least one with gradient.fresh = {self.fresh}, got none")
 
 
 @dataclass(frozen=True)
@@ -334,12 +499,33 @@ class Config:
         output: run folder; resolved config, versions, model, metrics, events and pictures go there.
         overfit: train and test on the first training pair alone, a quick check that everything can learn.
         compare_chains: also fit and evaluate CRF-Matching and CRF-Clustering alone.
+        init: a model, as a folder or by the name of a shipped one, whose weights first-order training begins with; none: it begins
+            with those of the staged fit.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
     model: ModelConfig = field(default_factory=ModelConfig)
     learning: LearningConfig = field(default_factory=LearningConfig)
+    gradient: GradientConfig = field(default_factory=GradientConfig)
+    unrolled: UnrolledConfig = field(default_factory=UnrolledConfig)
     experiment: ExperimentConfig = field(default_factory=ExperimentConfig)
     output: str = "runs/default"
     overfit: bool = False
     compare_chains: bool = True
+    init: str = ""
+
+    def __post_init__(self) -> None:
+        if self.learning.objective == "unrolled" and self.gradient.objective == "pseudo_likelihood":
+            raise ValueError("gradient.objective: expected unrolled with learning.objective unrolled, got pseudo_likelihood")
+        if self.init and self.first_order == "none":
+            raise ValueError(f"init: expected a gradient.objective to go on with from {self.init}, got none")
+
+    @property
+    def first_order(self) -> str:
+        """The loss of first-order training: `none`, `pseudo_likelihood` or `unrolled`."""
+        return "unrolled" if self.learning.objective == "unrolled" else self.gradient.objective
+
+    @property
+    def staged(self) -> LearningConfig:
+        """How the staged fit learns: what goes on through the unrolled iterations begins with pseudo-likelihood."""
+        return replace(self.learning, objective="pseudo_likelihood") if self.learning.objective == "unrolled" else self.learning

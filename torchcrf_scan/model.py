@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchcrf_scan.backend import can_decode, can_search
 from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.features.learned import EMBEDDING_WEIGHTS, Embeddings, ExtraLogUnary, LearnedInputs
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales, has_weight, live_weights
 from torchcrf_scan.inference import flooding, joint, lattice_likelihood, pseudo_likelihood
@@ -39,10 +40,14 @@ class JointScanCRF(nn.Module):
     extensions that are on (`FeatureConfig`). The boosters, the features' scales and the score of the start's hypotheses are
     buffers, fitted before the weights (`torchcrf_scan.learning`).
 
-    Gradients reach the weights and the points through log-beliefs and, with `inference.motion_weights = soft`, through the motions,
-    at fixed candidates and away from kinks (ties, capped errors). Without gradient: the labels, the start, the choice of
-    candidates, the unit of length, what beams measured, and the boosted scores, which are steps. The `flooding` schedule has no
-    gradient at all and fits its motions by Eq. 6 on hard labels whatever `motion_metric` and `motion_weights` say.
+    Gradients reach the weights, the points and what `forward` is given beside them through log-beliefs and, with
+    `inference.motion_weights = soft`, through the motions, at fixed candidates and away from kinks (ties, capped errors). Without
+    gradient: the labels, the start, the choice of candidates, the unit of length, what beams measured, and the boosted scores,
+    which are steps unless `features.smooth` is above 0. The `flooding` schedule has no gradient at all and fits its motions by
+    Eq. 6 on hard labels whatever `motion_metric` and `motion_weights` say.
+
+    With `features.embedding` there are two weights more in `association_weights`, `embedding` and `embedding_data` (see
+    `features.learned`), and with `features.learn_stumps` the boosters are parameters.
     """
 
     association_weights: nn.ParameterDict
@@ -51,10 +56,12 @@ class JointScanCRF(nn.Module):
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__()
         self.config = config or ModelConfig()
-        self.association_weights = self._zeros("association", ASSOCIATION_WEIGHTS)
+        features = self.config.features
+        embedding = EMBEDDING_WEIGHTS if features.embedding != "none" else ()
+        self.association_weights = self._zeros("association", (*ASSOCIATION_WEIGHTS, *embedding))
         self.clustering_weights = self._zeros("clustering", CLUSTERING_WEIGHTS)
         self.scales = Scales()
-        self.boosters = Boosters(self.config.features.stumps)
+        self.boosters = Boosters(features.stumps, width=features.smooth, is_learned=features.learn_stumps)
         self.hypothesis_score = HypothesisScore()
         self.calibration = Calibration()
         self.cluster_potential = ClusterPotential()
@@ -68,8 +75,10 @@ class JointScanCRF(nn.Module):
     @torch.no_grad()
     def reset_parameters(self) -> None:
         """Weights that decode something sensible before any learning: near in motion, in sequence, alike in shape."""
-        for weight in self.parameters():
+        for weight in (*self.association_weights.values(), *self.clustering_weights.values()):
             weight.zero_()
+        if "embedding" in self.association_weights:
+            self.association_weights["embedding"].fill_(1.0)
         start = {"registered_translation": 1.0, "sequence": 2.0, "pairwise_distance": 0.3, "pairwise_outlier": -1.0}
         for name, value in start.items():
             self.association_weights[name].fill_(value)
@@ -97,9 +106,45 @@ class JointScanCRF(nn.Module):
         """All that was learned, as the inference functions take it."""
         return Parameters(*self.weight_vectors, self.scales, self.boosters, self.calibration, self.cluster_potential)
 
-    def view(self, batch: ScanPairBatch) -> PairView:
-        """What the features need of a batch, computed once."""
-        return PairView.of(batch, self.config.features.wrap_closed, self.config.features.length_unit)
+    def view(self, batch: ScanPairBatch, learned: LearnedInputs | None = None) -> PairView:
+        """What the features need of a batch, computed once. learned: what `learned_inputs` made of a larger network's say."""
+        return PairView.of(batch, self.config.features.wrap_closed, self.config.features.length_unit, learned)
+
+    def learned_inputs(
+        self,
+        batch: ScanPairBatch,
+        *,
+        source_embedding: Tensor | None = None,
+        target_embedding: Tensor | None = None,
+        extra_log_unary: ExtraLogUnary | None = None,
+    ) -> LearnedInputs | None:
+        """The optional inputs of `forward`, checked; None where there are none."""
+        extra = extra_log_unary or ExtraLogUnary()
+        given = {"source_embedding": source_embedding, "target_embedding": target_embedding}
+        given |= {"extra_log_unary.outlier": extra.outlier, "extra_log_unary.moving": extra.moving}
+        if all(value is None for value in given.values()):
+            return None
+        if self.config.inference.schedule == "flooding":
+            raise ValueError("schedule: expected sweep with embeddings or extra_log_unary, got flooding")
+        for name, value in given.items():
+            points = batch.target_mask if name == "target_embedding" else batch.source_mask
+            wanted = (*points.shape, "C") if name.endswith("embedding") else tuple(points.shape)
+            if value is not None and (value.dim() != len(wanted) or value.shape[:2] != points.shape):
+                raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
+        outlier, moving = (None if of is None else torch.where(batch.source_mask, of, 0.0) for of in (extra.outlier, extra.moving))
+        return LearnedInputs(self._embeddings(batch, source_embedding, target_embedding), outlier, moving)
+
+    def _embeddings(self, batch: ScanPairBatch, source: Tensor | None, target: Tensor | None) -> Embeddings | None:
+        if source is None and target is None:
+            return None
+        kind = self.config.features.embedding
+        if kind == "none":
+            raise ValueError("source_embedding: expected none for a model with features.embedding none, got one")
+        if source is None or target is None or source.shape[2] != target.shape[2]:
+            got = [None if of is None else tuple(of.shape) for of in (source, target)]
+            raise ValueError(f"target_embedding: expected both embeddings with the same C, got {got[0]} and {got[1]}")
+        weights = self.association_weights["embedding"], self.association_weights["embedding_data"]
+        return Embeddings.of(source, target, (batch.source_mask, batch.target_mask), kind, weights)
 
     def initialise(self, batch: ScanPairBatch) -> Start:
         """InitialiseRT: the motions to begin with (Algorithm 1, line 1). No gradient."""
@@ -118,27 +163,41 @@ class JointScanCRF(nn.Module):
         look = {"paper": paper_start, "points": points_start}[self.config.start]
         return look(view, found.scaled(view.factor), self.fitted, self.config.inference).scaled(1 / view.factor)
 
-    def forward(self, batch: ScanPairBatch, start: Start | None = None) -> Prediction:
+    def forward(
+        self,
+        batch: ScanPairBatch,
+        start: Start | None = None,
+        *,
+        source_embedding: Tensor | None = None,
+        target_embedding: Tensor | None = None,
+        extra_log_unary: ExtraLogUnary | None = None,
+    ) -> Prediction:
         """Labels, motions and log-beliefs of every pair.
 
         Args:
             batch: B pairs.
             start: motions to begin with; looked for where absent. For `ClusteringCRF` its association is the fixed one.
+            source_embedding, target_embedding: (B, N, C), (B, M, C) of the points, for a model with `features.embedding`: alike
+                ones are associated. The start is looked for without them. None: as if the model knew none.
+            extra_log_unary: (B, N) learned log potentials of outliers and of moving points.
         """
-        if self._is_compiled(batch):
+        learned = self.learned_inputs(
+            batch, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
+        )
+        if self._is_compiled(batch, has_learned_inputs=learned is not None):
             return self._predict_compiled(batch, start)
         start = start or self.initialise(batch)
-        view = self.view(batch)
+        view = self.view(batch, learned)
         schedule = {"sweep": joint.decode, "flooding": flooding.decode}[self.config.inference.schedule]
         prediction = schedule(view, start.scaled(view.factor), self.fitted, self.config)
         uncertainty = prediction.uncertainty and prediction.uncertainty.scaled(1 / view.factor)
         return replace(prediction, motions=scale_motions(prediction.motions, 1 / view.factor), uncertainty=uncertainty)
 
-    def _is_compiled(self, batch: ScanPairBatch) -> bool:
+    def _is_compiled(self, batch: ScanPairBatch, *, has_learned_inputs: bool = False) -> bool:
         """Whether compiled code answers: there is no gradient to follow, and no scan is empty, which is left to tensors."""
         tensors = (*self.parameters(), batch.source, batch.target, batch.initial_motion)
         needs_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-        is_possible = can_decode(self.config, batch.source, needs_gradient=needs_gradient)
+        is_possible = can_decode(self.config, batch.source, needs_gradient=needs_gradient, has_learned_inputs=has_learned_inputs)
         return is_possible and bool(batch.source_mask[:, :1].all() and batch.target_mask[:, :1].all())
 
     def _predict_compiled(self, batch: ScanPairBatch, start: Start | None) -> Prediction:
@@ -204,11 +263,15 @@ class JointScanCRF(nn.Module):
             os.replace(temporary, folder / name)
 
     @classmethod
-    def from_pretrained(cls, name_or_path: str | Path = PRETRAINED, **inference: Any) -> JointScanCRF:
+    def from_pretrained(
+        cls, name_or_path: str | Path = PRETRAINED, *, features: dict[str, Any] | None = None, **inference: Any
+    ) -> JointScanCRF:
         """A model from a folder written by `save_pretrained`, or one that the package ships, by name.
 
         Args:
             name_or_path: a folder, or a name under `torchcrf_scan/weights`.
+            features: `smooth`, `learn_stumps` or `embedding` of `FeatureConfig` to change; weights that the saved model has not
+                begin as in a new one.
             inference: fields of `InferenceConfig` to change, e.g. `candidates=0`.
         """
         from safetensors.torch import load
@@ -217,8 +280,12 @@ class JointScanCRF(nn.Module):
         config = model_config(json.loads((folder / "config.json").read_text()))
         if inference:
             config = replace(config, inference=replace(config.inference, **inference))
+        if features:
+            config = replace(config, features=replace(config.features, **features))
         model = cls(config)
-        model.load_state_dict(load((folder / "model.safetensors").read_bytes()))
+        saved = load((folder / "model.safetensors").read_bytes())
+        fresh = {name: value for name, value in model.state_dict().items() if name.rpartition(".")[2] in EMBEDDING_WEIGHTS}
+        model.load_state_dict({**fresh, **saved} if features else saved)
         return model.eval()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError
@@ -28,7 +28,7 @@ def load_model(name: str, candidates: int | None = None, device: str = "cpu", th
         if threads < 1:
             raise ValueError(f"--threads: expected at least 1, got {threads}")
         torch.set_num_threads(threads)
-    changes = {} if candidates is None else {"candidates": candidates}
+    changes: dict[str, Any] = {} if candidates is None else {"candidates": candidates}
     try:
         model = JointScanCRF.from_pretrained(name, **changes)
     except (ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcrf_scan.compiled.jit import Array, kernel
-from torchcrf_scan.compiled.surface import lower_median, rising_turn, turn_apart, within_circle
+from torchcrf_scan.compiled.surface import lower_median, rising_turn
 from torchcrf_scan.features.free_space import SLACK_SHARE, SLACK_STEPS, WIDEST_GAP
 
+BACKWARDS = 1e-4  # radians; a step back by so little is no turn
 USUAL_STEP = math.radians(0.5)  # of a scan with one point
 
 
@@ -64,6 +65,20 @@ def first_from(rising: Array, value: float) -> int:
 
 
 @kernel
+def within_circle(angle: float) -> float:
+    """angle % (2 pi), which it seldom takes a division for."""
+    if angle < 0:
+        angle += 2 * math.pi
+    return angle if 0 <= angle < 2 * math.pi else angle % (2 * math.pi)
+
+
+@kernel
+def turn_between(before: float, after: float) -> float:
+    """`surface.rising_turn` from one bearing to another."""
+    return max(within_circle(after - before + BACKWARDS) - BACKWARDS, 0.0)
+
+
+@kernel
 def look(sweep: Sweep, x: float, y: float) -> tuple[float, float]:
     """How far the beams contradict a point in their frame (they went on past it) and hide it, each from 0 (not) to 1 (clearly)."""
     N = len(sweep.ranges)
@@ -81,7 +96,7 @@ def look(sweep: Sweep, x: float, y: float) -> tuple[float, float]:
             return 0.0, 1.0
         left, right = max(after - 1, 0), min(after, N - 1)
     if left != right:
-        beside = max(turn_apart(bearing - sweep.bearings[left]), turn_apart(sweep.bearings[right] - bearing))
+        beside = max(turn_between(sweep.bearings[left], bearing), turn_between(bearing, sweep.bearings[right]))
         if not beside < WIDEST_GAP * sweep.step:
             return 0.0, 0.0
     near, far = min(sweep.ranges[left], sweep.ranges[right]), max(sweep.ranges[left], sweep.ranges[right])

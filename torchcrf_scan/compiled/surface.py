@@ -39,17 +39,9 @@ def rising_turn(difference: float) -> float:
 
 
 @kernel
-def turn_apart(difference: float) -> float:
+def _turn_apart(difference: float) -> float:
     """The same without a division where there are no whole turns to take off; not to the last digit."""
     return max(difference, 0.0) if -BACKWARDS <= difference < 6.0 else rising_turn(difference)
-
-
-@kernel
-def within_circle(angle: float) -> float:
-    """angle % (2 pi), which it seldom takes a division for."""
-    if angle < 0:
-        angle += 2 * math.pi
-    return angle if 0 <= angle < 2 * math.pi else angle % (2 * math.pi)
 
 
 @kernel
@@ -121,7 +113,10 @@ def surface_of(points: Array, noise: float, is_closed: bool, origin: Array) -> S
 def bearing_of(scan: Surface, dx: float, dy: float) -> float:
     """The direction of (dx, dy) as a number on the scale of the scan's rising bearings."""
     first, half = scan.bearings[0], scan.step / 2
-    return first + within_circle(math.atan2(dy, dx) - first + half) - half
+    turned = math.atan2(dy, dx) - first + half
+    if not 0 <= turned < 2 * math.pi:
+        turned %= 2 * math.pi
+    return first + turned - half
 
 
 @kernel
@@ -133,7 +128,7 @@ def look_between(scan: Surface, bearing: float, after: int, reach: float) -> int
     left, right = max(after - 1, 0), min(after, M - 1)
     if scan.is_closed:
         left, right = (after - 1 if after > 0 else M - 1), (after if after < M else 0)
-    apart = max(turn_apart(bearing - scan.bearings[left]), turn_apart(scan.bearings[right] - bearing))
+    apart = max(_turn_apart(bearing - scan.bearings[left]), _turn_apart(scan.bearings[right] - bearing))
     if left == right:
         apart = min(apart, half)
     if not apart < WIDEST_GAP * scan.step:

@@ -1,7 +1,7 @@
 """AdaBoost over decision stumps, evaluated in torch.
 
 A sum of stumps is additive over features, so the ensemble is one lookup table a feature: the thresholds, and the margin between
-each two of them. Fitting is `learning/boosting_fit.py`.
+each two of them. Fitting is `learning/boosting_fit.py`. The smooth variant puts a sigmoid in the place of every step.
 """
 
 from __future__ import annotations
@@ -13,24 +13,33 @@ from torch import Tensor, nn
 class StumpEnsemble(nn.Module):
     """H(phi) = sum_t alpha_t h_t(phi) over `stumps` decision stumps (spec 2.2); zero until it is fitted.
 
-    Step-shaped: its gradient with respect to the inputs is zero wherever it is defined.
+    With width 0 it is step-shaped: its gradient with respect to the inputs is zero wherever it is defined. With a width above 0
+    every step is a sigmoid of that width: differentiable in inputs, thresholds and table, and as the width goes to 0 the same
+    margins but at the thresholds themselves, where a sigmoid is half way up.
 
     Attributes:
-        thresholds: (F, T) ascending, padded with inf.
+        thresholds: (F, T) ascending, padded with inf; at most T of all are finite.
         table: (F, T+1) margin of feature f between its thresholds.
+        width: of the sigmoids, in units of the inputs; 0: steps.
     """
 
     thresholds: Tensor
     table: Tensor
 
-    def __init__(self, features: int, stumps: int = 50) -> None:
+    def __init__(self, features: int, stumps: int = 50, *, width: float = 0.0, is_learned: bool = False) -> None:
+        """is_learned: thresholds and table are parameters, not buffers."""
         super().__init__()
-        self.register_buffer("thresholds", torch.full((features, stumps), torch.inf))
-        self.register_buffer("table", torch.zeros(features, stumps + 1))
+        self.width = width
+        empty = {"thresholds": torch.full((features, stumps), torch.inf), "table": torch.zeros(features, stumps + 1)}
+        for name, value in empty.items():
+            if is_learned:
+                self.register_parameter(name, nn.Parameter(value))
+            else:
+                self.register_buffer(name, value)
 
     def extra_repr(self) -> str:
         """Shape of the ensemble."""
-        return f"features={self.thresholds.shape[0]}, stumps={self.thresholds.shape[1]}"
+        return f"features={self.thresholds.shape[0]}, stumps={self.thresholds.shape[1]}, width={self.width}"
 
     @torch.no_grad()
     def set_stumps(self, feature: Tensor, threshold: Tensor, left: Tensor, right: Tensor) -> None:
@@ -52,6 +61,8 @@ class StumpEnsemble(nn.Module):
         Lets what does not change between iterations be kept: only the registered channel depends on the motions (spec 2.5.4).
         """
         rows = slice(first, first + phi.shape[-1])
+        if self.width > 0:
+            return smooth_margins(phi, self.thresholds[rows], self.table[rows], self.width)
         flat = phi.detach().reshape(-1, phi.shape[-1]).T.contiguous()  # (n, P)
         place = torch.searchsorted(self.thresholds[rows].to(flat.dtype), flat)  # thresholds below phi
         return self.table[rows].gather(1, place).sum(0).view(phi.shape[:-1])
@@ -61,3 +72,19 @@ class StumpEnsemble(nn.Module):
         if phi.shape[-1] != len(self.thresholds):
             raise ValueError(f"phi: expected {len(self.thresholds)} features, got {phi.shape[-1]}")
         return self.margins(phi)
+
+
+def smooth_margins(phi: Tensor, thresholds: Tensor, table: Tensor, width: float) -> Tensor:
+    """Margins whose steps are sigmoids: table[f, 0] + sum_t (table[f, t+1] - table[f, t]) sigmoid((phi_f - threshold_ft) / width).
+
+    Args:
+        phi: (..., F). thresholds: (F, T), of which at most T are finite. table: (F, T+1).
+
+    Returns:
+        (...), at the cost of T sigmoids each, for padding is left out.
+    """
+    T = thresholds.shape[1]
+    order = thresholds.detach().flatten().argsort(stable=True)[:T]  # the finite ones of all features, and some padding
+    threshold, step = thresholds.flatten()[order].to(phi), table.diff(dim=1).flatten()[order].to(phi)
+    rise = torch.sigmoid((phi.index_select(-1, order // T) - threshold) / width)  # (..., T)
+    return table[:, 0].sum().to(phi) + (rise * step).sum(-1)

@@ -14,6 +14,7 @@ from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.features.candidates import Candidates
 from torchcrf_scan.features.extension import association_extension, clustering_extension
 from torchcrf_scan.features.free_space import Sweep, look
+from torchcrf_scan.features.learned import LearnedInputs, add_log
 from torchcrf_scan.features.scales import (
     ASSOCIATION_UNARY,
     CLUSTERING_UNARY,
@@ -33,10 +34,11 @@ REFERENCE_UNIT = 0.1  # metres; the resolution of a street scanner, so that scal
 class Boosters(nn.Module):
     """The two boosted features: `data` scores a pair of points, `outlier` a source point (spec 2.2, 2.3)."""
 
-    def __init__(self, stumps: int = 50) -> None:
+    def __init__(self, stumps: int = 50, *, width: float = 0.0, is_learned: bool = False) -> None:
+        """width, is_learned: as in `StumpEnsemble`."""
         super().__init__()
-        self.data = StumpEnsemble(len(LOCAL_CHANNELS), stumps)
-        self.outlier = StumpEnsemble(OUTLIER_INPUTS, stumps)
+        self.data = StumpEnsemble(len(LOCAL_CHANNELS), stumps, width=width, is_learned=is_learned)
+        self.outlier = StumpEnsemble(OUTLIER_INPUTS, stumps, width=width, is_learned=is_learned)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,7 @@ class PairView:
         batch: the pairs in the unit of length that features are measured in.
         factor: (B,) that unit's factor on metres.
         source_sweep, target_sweep: the scans as the sensor saw them.
+        learned: what a larger network says of the points; None: nothing.
     """
 
     batch: ScanPairBatch
@@ -55,9 +58,12 @@ class PairView:
     factor: Tensor
     source_sweep: Sweep
     target_sweep: Sweep
+    learned: LearnedInputs | None = None
 
     @classmethod
-    def of(cls, batch: ScanPairBatch, wrap_closed: bool = True, length_unit: str = "metre") -> PairView:
+    def of(
+        cls, batch: ScanPairBatch, wrap_closed: bool = True, length_unit: str = "metre", learned: LearnedInputs | None = None
+    ) -> PairView:
         """Describes both scans.
 
         Args:
@@ -75,6 +81,7 @@ class PairView:
             factor,
             Sweep.of(batch.source, batch.source_mask, source_closed, batch.range_noise, here),
             Sweep.of(batch.target, batch.target_mask, target_closed, batch.range_noise, batch.target_origin),
+            learned,
         )
 
 
@@ -96,7 +103,7 @@ class AssociationStates:
     Attributes:
         candidates, mask: (B, N, K) target points and which of them are real.
         static: (B, N, K, 11) channels L1..L11.
-        static_margin: (B, N, K) data booster over them (spec 2.5.4).
+        static_margin: (B, N, K) data booster over them (spec 2.5.4), and the learned similarity's share in the data score.
     """
 
     candidates: Tensor
@@ -111,7 +118,10 @@ class AssociationStates:
         shape = association.shape_features(view.source_shape, view.target_shape, candidates, scales)
         position = association.position_features(batch.source, batch.target, candidates, batch.initial_motion, scales)
         static = torch.cat([shape, position], dim=-1)
-        return cls(candidates, mask, static, boosters.data.margins(static))
+        margin = boosters.data.margins(static)
+        if view.learned is not None and view.learned.embeddings is not None:
+            margin = margin + view.learned.embeddings.data_score(candidates)
+        return cls(candidates, mask, static, margin)
 
     def nodes(self, part: slice) -> AssociationStates:
         """The states of a run of source points."""
@@ -155,13 +165,16 @@ def state_mask(mask: Tensor) -> Tensor:
     return torch.cat([mask, mask.new_ones(*mask.shape[:2], 1)], dim=-1)
 
 
-def association_potentials(unary: Tensor, pairwise: Tensor, mask: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def association_potentials(
+    unary: Tensor, pairwise: Tensor, mask: Tensor, weights: Tensor, extra: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Log potentials (B, N, K+1) and (B, N-1, K+1, K+1) of the association chain.
 
     Args:
         unary: (B, N, K+1, 19). pairwise: (B, N-1, K+1, K+1, 4). mask: (B, N, K) real candidates. weights: (23,).
+        extra: (B, N, K+1) learned log potentials to add; None: none.
     """
-    log_unary = (unary @ weights[:ASSOCIATION_UNARY]).masked_fill(~state_mask(mask), -torch.inf)
+    log_unary = add_log(unary @ weights[:ASSOCIATION_UNARY], extra).masked_fill(~state_mask(mask), -torch.inf)
     return log_unary, pairwise @ weights[ASSOCIATION_UNARY:]
 
 
@@ -187,13 +200,16 @@ def possible_clusters(active: Tensor, reach: Tensor | None, points: int) -> Tens
     return torch.cat([inliers, inliers.new_ones(*inliers.shape[:2], 1)], dim=-1)
 
 
-def clustering_potentials(local: Tensor, pairwise: Tensor, possible: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def clustering_potentials(
+    local: Tensor, pairwise: Tensor, possible: Tensor, weights: Tensor, extra: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Log potentials (B, N, D) and (B, N-1, D, D) of the clustering chain (spec 7.5: inactive clusters are impossible).
 
     Args:
         local: (B, N, D, 12). pairwise: (B, N-1, D, D, 8). possible: (B, N, D) bool. weights: (20,).
+        extra: (B, N, D) learned log potentials to add; None: none.
     """
-    log_unary = (local @ weights[:CLUSTERING_UNARY]).masked_fill(~possible, -torch.inf)
+    log_unary = add_log(local @ weights[:CLUSTERING_UNARY], extra).masked_fill(~possible, -torch.inf)
     return log_unary, pairwise @ weights[CLUSTERING_UNARY:]
 
 

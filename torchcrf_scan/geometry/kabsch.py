@@ -22,11 +22,12 @@ def kabsch(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
         weights: (..., P), non-negative.
 
     Returns:
-        (..., 3) motions; the identity where all weights are 0. Gradients are finite everywhere; where the rotation is
-        undetermined (one point, identical points) its gradient is 0.
+        (..., 3) motions; the identity where all weights are 0, or so small that no product of two can be held. Gradients are
+        finite everywhere; where the rotation is undetermined (one point, identical points) its gradient is 0.
     """
     total = weights.sum(-1, keepdim=True)  # (..., 1)
-    share = weights / torch.where(total > 0, total, torch.ones_like(total))
+    some = total > torch.finfo(total.dtype).tiny ** 0.5  # less is no weight: shares of it have slopes that no float can hold
+    share = weights * some / torch.where(some, total, torch.ones_like(total))
     source_mean = (share[..., None] * source).sum(-2)  # (..., 2)
     target_mean = (share[..., None] * target).sum(-2)
     p, q = source - source_mean[..., None, :], target - target_mean[..., None, :]

@@ -18,6 +18,7 @@ from torchcrf_scan.features import clustering
 from torchcrf_scan.features.association import pairwise_features
 from torchcrf_scan.features.candidates import Candidates, with_targets
 from torchcrf_scan.features.lattice import lattice_features
+from torchcrf_scan.features.learned import association_extra, clustering_extra
 from torchcrf_scan.features.potentials import (
     AssociationStates,
     Boosters,
@@ -58,7 +59,7 @@ class Parameters:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """One round's state of B pairs.
+    """One round's state of B pairs. Gradients reach the log-beliefs and, where soft, the motions; labels have none.
 
     Attributes:
         motions: motions and which clusters exist.
@@ -76,8 +77,29 @@ class State:
     log_cluster: Tensor
 
 
+@dataclass(frozen=True, slots=True)
+class Round:
+    """What B pairs had come to after a round.
+
+    Attributes:
+        state: labels, beliefs and motions.
+        converged: (B,) bool, settled. iterations: (B,) rounds done.
+    """
+
+    state: State
+    converged: Tensor
+    iterations: Tensor
+
+
 def decode(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> Prediction:
     """Labels and motions of a batch by the sweep schedule; differentiable through beliefs and, where soft, through motions."""
+    last = rounds(view, start, parameters, model)[-1]
+    merged = merge_alike(view, last.state, parameters.scales.cluster_distance)
+    return read_out(view, start, merged, parameters, model.inference, last.converged, last.iterations)
+
+
+def rounds(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> list[Round]:
+    """The start and every round after it. With `stop_early` off there are `iterations` of them, and no step depends on a value."""
     batch, config = view.batch, model.inference
     is_chosen = config.movers == "threshold" or start.log_odds is None or model.chains == "matching"
     start = start if is_chosen else start.considered()
@@ -85,6 +107,7 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
     before = state
     converged = torch.zeros(len(batch), dtype=torch.bool, device=batch.source.device)
     iterations = torch.zeros(len(batch), dtype=torch.int64, device=batch.source.device)
+    found = [Round(state, converged, iterations)]
     for done in range(config.iterations):
         if done < SELECTION_ROUNDS and not is_chosen:
             state = discard_vacuous(view, start, state, parameters, config)
@@ -95,10 +118,10 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
         before, state = state, after
         iterations = iterations + (~converged | (not config.stop_early)).long()
         converged = converged | has_settled(state, before, config)
+        found.append(Round(state, converged, iterations))
         if config.stop_early and bool(converged.all()):
             break
-    merged = merge_alike(view, state, parameters.scales.cluster_distance)
-    return read_out(view, start, merged, parameters, config, converged, iterations)
+    return found
 
 
 def first_state(view: PairView, start: Start, parameters: Parameters, config: InferenceConfig) -> State:
@@ -113,7 +136,7 @@ def first_state(view: PairView, start: Start, parameters: Parameters, config: In
     C = start.motions.shape[1]
 
     def certain(label: Tensor, states: int) -> Tensor:
-        is_label = torch.nn.functional.one_hot(label, states).bool()
+        is_label = label[..., None] == torch.arange(states, device=label.device)
         return torch.zeros_like(is_label, dtype=batch.source.dtype).masked_fill(~is_label, -torch.inf)
 
     return State(
@@ -141,6 +164,7 @@ def step(
     With `coupling` lattice: both chains as one, motions.
     """
     found = find_candidates(view, state.motions.value, state.motions.active, config)
+    state = hold_motions(state, config)
     if coupling == "lattice":
         state = update_lattice(view, start, state, found, parameters, config)
         state = update_motions(view, start, state, parameters, config)
@@ -149,11 +173,19 @@ def step(
         state = update_clusters(view, start, state, found, parameters, config)
         state = update_motions(view, start, state, parameters, config)
     if chains != "clustering":
+        state = hold_motions(state, config)
         state = update_association(view, state, found, parameters, config)
         if chains == "matching":
             state = inliers_are_background(state)
         state = update_motions(view, start, state, parameters, config, trimmed=chains == "matching")
     return replace(state, motions=retire_empty(state.motions, count_points(state)))
+
+
+def hold_motions(state: State, config: InferenceConfig) -> State:
+    """The state as features see it: with `detach_motion`, its motions without gradient."""
+    if not config.detach_motion:
+        return state
+    return replace(state, motions=replace(state.motions, value=state.motions.value.detach()))
 
 
 def count_points(state: State) -> Tensor:
@@ -164,7 +196,9 @@ def count_points(state: State) -> Tensor:
 
 def inliers_are_background(state: State) -> State:
     """The clusters of CRF-Matching, which has none: every associated point is background, the others are outliers."""
-    log_inlier = state.log_association[..., :-1].logsumexp(-1)
+    log_inliers = state.log_association[..., :-1]
+    none = (log_inliers == -torch.inf).all(-1)  # logsumexp has no gradient there
+    log_inlier = log_inliers.masked_fill(none[..., None], 0.0).logsumexp(-1).masked_fill(none, -torch.inf)
     log_cluster = torch.stack([log_inlier, state.log_association[..., -1]], dim=-1)
     return replace(state, cluster=torch.where(state.association >= 0, 0, -1), log_cluster=log_cluster)
 
@@ -178,7 +212,8 @@ def update_clusters(
     local = clustering_unary(view, at, state.motions.value, state.motions.active, scales)
     pairwise = clustering.pairwise_features(batch.source, at, scales)
     possible = possible_clusters(state.motions.active, start.reach, batch.source.shape[1])
-    potentials = clustering_potentials(local, pairwise, possible, parameters.clustering)
+    extra = clustering_extra(view.learned, possible.shape[-1])
+    potentials = clustering_potentials(local, pairwise, possible, parameters.clustering, extra)
     log_cluster = chain_beliefs(*potentials, batch.source_mask, config.temperature)
     labels = cluster_labels(log_cluster.argmax(-1), log_cluster.shape[-1] - 1, batch.source_mask)
     return replace(state, log_cluster=log_cluster, cluster=labels)
@@ -196,7 +231,8 @@ def update_association(view: PairView, state: State, found: Candidates, paramete
     moved = registered_points(batch.source, state.motions.value, state.motions.active, state.log_cluster)
     unary = association_unary(view, states, moved, scales, boosters)
     pairwise = pairwise_features(batch.source, batch.target, found.index, scales)
-    potentials = association_potentials(unary, pairwise, found.mask, parameters.association)
+    extra = association_extra(view.learned, found.index)
+    potentials = association_potentials(unary, pairwise, found.mask, parameters.association, extra)
     log_association = chain_beliefs(*potentials, batch.source_mask, config.temperature)
     labels = association_labels(log_association.argmax(-1), found.index, batch.source_mask)
     return replace(state, candidates=found.index, candidate_mask=found.mask, log_association=log_association, association=labels)
@@ -225,6 +261,11 @@ def update_lattice(
     possible = possible_clusters(motions.active, start.reach, batch.source.shape[1])
     features = lattice_features(view, states, motions.value, found.nearest, possible, parameters.scales, parameters.boosters)
     potentials = features.potentials(torch.cat([parameters.association, parameters.clustering]))
+    of_association, of_cluster = association_extra(view.learned, found.index), clustering_extra(view.learned, possible.shape[-1])
+    if of_association is not None:
+        potentials = replace(potentials, log_unary=potentials.log_unary + of_association[..., None])
+    if of_cluster is not None:
+        potentials = replace(potentials, log_unary=potentials.log_unary + of_cluster[:, :, None])
     beliefs = lattice_beliefs(potentials, batch.source_mask, config.temperature)
     place, cluster = beliefs.best()
     return replace(
@@ -304,9 +345,9 @@ def merge_alike(view: PairView, state: State, scale: Tensor) -> State:
     They are one when their rotations differ by less than 0.01 rad and, over the points of both, their translations by less than
     `scale`. A cluster without points is not merged.
     """
-    motions = state.motions
+    motions = replace(state.motions, value=state.motions.value.detach())  # a decision, not a function to follow
     C = motions.value.shape[1]
-    members = torch.nn.functional.one_hot(state.cluster.clamp(min=0), C).to(motions.value) * (state.cluster >= 0)[..., None]
+    members = (state.cluster[..., None] == torch.arange(C, device=state.cluster.device)).to(motions.value)
     moved = se2.apply(motions.value, view.batch.source[:, None])  # (B, C, N, 2)
     total = members.sum(1)  # (B, C)
     for low in range(C - 1):

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features import clustering
+from torchcrf_scan.features.learned import clustering_extra
 from torchcrf_scan.features.potentials import PairView, clustering_potentials, clustering_unary, find_candidates, possible_clusters
 from torchcrf_scan.inference.messages import log_partition, silence_padding
 
@@ -67,7 +68,7 @@ def discard_vacuous(view: PairView, start: Start, state: State, parameters: Para
         worth = parameters.potential(evidence(view, start, state, parameters, config), start.log_odds)  # (B, C)
         is_mover = torch.arange(worth.shape[1], device=worth.device) > 0
         least, which = worth.masked_fill(~(state.motions.active & is_mover), torch.inf).min(-1)
-        is_vacuous = torch.nn.functional.one_hot(which, worth.shape[1]).bool() & (least < 0)[:, None]
+        is_vacuous = (which[:, None] == torch.arange(worth.shape[1], device=worth.device)) & (least < 0)[:, None]
         if config.stop_early and not bool(is_vacuous.any()):
             break
         state = replace(state, motions=replace(state.motions, active=state.motions.active & ~is_vacuous))
@@ -90,7 +91,8 @@ def evidence(view: PairView, start: Start, state: State, parameters: Parameters,
     there = motions.active.expand(C, B, C).clone()  # row 0: all clusters; row k: without cluster k
     there[1:] &= ~torch.eye(C, dtype=torch.bool, device=there.device)[1:, None]
     possible = torch.stack([possible_clusters(row, start.reach, batch.source.shape[1]) for row in there])  # (C, B, N, D)
-    log_unary, log_pairwise = clustering_potentials(local, pairwise, torch.ones_like(possible[0]), parameters.clustering)
+    extra = clustering_extra(view.learned, C + 1)
+    log_unary, log_pairwise = clustering_potentials(local, pairwise, torch.ones_like(possible[0]), parameters.clustering, extra)
     totals = log_partition(
         *silence_padding(
             log_unary.masked_fill(~possible, -torch.inf).flatten(0, 1),

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import platform
 import subprocess
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from torchcrf_scan.baselines.cascade import Cascade
 from torchcrf_scan.batch import Prediction, ScanPairBatch
-from torchcrf_scan.config import WORLDS, Config, DataConfig
-from torchcrf_scan.data.dataset import PairFiles
+from torchcrf_scan.config import WORLDS, AugmentConfig, Config, DataConfig
+from torchcrf_scan.data.dataset import PairFiles, split_by_sequence
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import Table, report
@@ -26,11 +29,15 @@ from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.cascade_fit import fit_cascade
+from torchcrf_scan.learning.checkpoint import Store, write_bytes
 from torchcrf_scan.learning.fit import fit
+from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.material import Material, collect
+from torchcrf_scan.learning.ranks import ALONE, Ranks, join
 from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.viz.monitor import TrainingMonitor
 from torchcrf_scan.viz.tensorboard import RunLog
 
 log = logging.getLogger(__name__)
@@ -39,37 +46,133 @@ TEST_SEED = 10_000  # simulated test worlds start here, far from those of traini
 Decoder = Callable[[ScanPairBatch, Start], Prediction]
 
 
-def train(config: Config) -> dict[str, list[PairScore]]:
-    """Runs the whole of `config` and leaves the run folder behind. Returns every method's scores on the test pairs."""
+def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]:
+    """Runs the whole of `config` and leaves the run folder behind. Returns every method's scores on the test pairs.
+
+    Under `torchrun` the first process does the staged fit and writes; all of them share the steps of first-order training and the
+    test pairs.
+
+    resume: go on from the checkpoint in the run folder, where there is one; else begin anew.
+    """
+    with join(config.gradient.device if config.first_order != "none" else "cpu") as ranks:
+        return train_together(config, ranks, resume=resume)
+
+
+def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dict[str, list[PairScore]]:
+    """This process's share of `train`."""
     folder = Path(config.output)
     folder.mkdir(parents=True, exist_ok=True)
     train_pairs, test_pairs = load_data(config.data)
     if config.overfit:
         train_pairs = test_pairs = train_pairs[:1]
+        config = replace(config, gradient=replace(config.gradient, fresh=0.0, augment=AugmentConfig.nothing()))
     else:
         refuse_leaks(train_pairs, test_pairs)
-    log.info("%d training pairs, %d test pairs", len(train_pairs), len(test_pairs))
+    train_pairs, held_out = hold_out(train_pairs, config)
+    log.info("%d training pairs, %d validation pairs, %d test pairs", len(train_pairs), len(held_out), len(test_pairs))
 
     began = time.perf_counter()
-    with RunLog(folder) as run:
+    store = Store(folder, settings_of(config))
+    state = ranks.share(store.read() if resume and ranks.is_first else None)
+    if not resume and ranks.is_first:
+        store.path.unlink(missing_ok=True)  # of another run: this one must not go on from there
+    if resume:
+        log.info("going on from step %d" if state else "no checkpoint yet, beginning anew", *([state["step"]] if state else []))
+    with RunLog(folder) if ranks.is_first else nullcontext() as run:
         model = JointScanCRF(config.model)
-        collection = collect(train_pairs, config.learning, jobs=-1, backend=config.model.inference.backend)
-        everything = range(len(collection))
-        model.hypothesis_score = collection.fit_score(everything)
-        clusters = config.model.inference.clusters - 1
-        material = collection.material(everything, model.hypothesis_score, clusters, config.learning)
-        decoders = fit_methods(model, material, config, run)
-        model.save_pretrained(folder / "model")
-        log.info("fitted in %.0f s", time.perf_counter() - began)
-
-        scores, answers = evaluate(model, decoders, test_pairs, config.learning.batch_size)
+        material = prepare(model, train_pairs, config, run, state) if run is not None else []
+        if config.first_order != "none":
+            ranks.share_weights(model)
+            first_step = state["step"] + 1 if state else None
+            with TrainingMonitor(folder, config, first_step) if ranks.is_first else nullcontext() as monitor:
+                train_by_gradient(model, config, train_pairs, held_out, store, ranks, monitor, state=state)
+        cascade = None
+        if run is not None:
+            calibrate(model, material)
+            cascade = fit_baselines(material, config, run)
+            model.save_pretrained(folder / "model")
+            log.info("fitted in %.0f s", time.perf_counter() - began)
+        ranks.share_weights(model)
+        decoders = decoders_of(model, ranks.share(cascade))
+        scores, answers = evaluate(model, decoders, test_pairs, config.learning.batch_size, ranks)
+        if run is None:
+            return scores
         for step, k in enumerate(pairs_to_draw(test_pairs)):
             run.picture(test_pairs[k], answers["joint"][k], step)
         for method, of_method in scores.items():
             run.metrics(method, summarise(of_method))
+    if config.first_order != "none" and scores["joint"]:
+        with TrainingMonitor(folder, config, config.gradient.steps + 1) as monitor:
+            monitor.finished(flatten(config), summarise(scores["joint"]), config.gradient.steps)
     tables = report(scores) if scores["joint"] else []
     write_results(folder, scores, tables)
     return scores
+
+
+def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], list[ScanPair]]:
+    """Training and validation pairs, sequences whole; all for training where there is no first-order training to stop early.
+
+    Raises:
+        ValueError: too few sequences to hold one out.
+    """
+    if config.first_order == "none" or config.gradient.validation == 0 or config.overfit:
+        return pairs, []
+    try:
+        return split_by_sequence(pairs, config.gradient.validation, config.gradient.seed)
+    except ValueError as error:
+        raise ValueError(f"gradient.validation: {error}") from error
+
+
+def prepare(
+    model: JointScanCRF, pairs: Sequence[ScanPair], config: Config, run: RunLog, state: dict[str, Any] | None
+) -> list[Material]:
+    """Material from the pairs, and the model as training finds it: fitted in stages, from `config.init`, or from a checkpoint."""
+    collection = collect(pairs, config.learning, jobs=-1, backend=config.model.inference.backend)
+    everything = range(len(collection))
+    if state is not None:
+        model.load_state_dict(state["best"] or state["model"])
+    elif config.init:
+        load_weights(model, config.init)
+    else:
+        model.hypothesis_score = collection.fit_score(everything)
+    clusters = config.model.inference.clusters - 1
+    material = collection.material(everything, model.hypothesis_score, clusters, config.learning)
+    if state is None and not config.init:
+        fit(model, material, config.staged, watches(run, "joint"))
+    return material
+
+
+def load_weights(model: JointScanCRF, name_or_path: str) -> None:
+    """Takes over the weights of a saved model.
+
+    Raises:
+        ValueError: no such model, or one of other features.
+    """
+    saved = JointScanCRF.from_pretrained(name_or_path).state_dict()
+    try:
+        model.load_state_dict(saved)
+    except RuntimeError as error:
+        raise ValueError(f"init: expected a model with the features of `model.features`, got {name_or_path}: {error}") from error
+
+
+def settings_of(config: Config) -> dict[str, str]:
+    """By name, the settings that a run which goes on must have in common with the one that was broken off."""
+    free = (
+        "output",
+        "compare_chains",
+        "experiment.",
+        *(f"gradient.{name}" for name in ("workers", "checkpoint_every", "device", "graph")),
+    )
+    return {name: json.dumps(value) for name, value in flatten(config).items() if not name.startswith(free)}
+
+
+def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Every setting by its full name."""
+    found: dict[str, Any] = {}
+    for of in fields(config):
+        value, name = getattr(config, of.name), prefix + of.name
+        found |= flatten(value, f"{name}.") if is_dataclass(value) else {name: value}
+    return found
 
 
 def load_data(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
@@ -95,14 +198,20 @@ def refuse_leaks(train_pairs: Sequence[ScanPair], test_pairs: Sequence[ScanPair]
         raise ValueError(f"data: expected no sequence in both training and test pairs, got {', '.join(both[:5])}")
 
 
-def fit_methods(model: JointScanCRF, material: list[Material], config: Config, run: RunLog) -> dict[str, Decoder]:
-    """Fits the joint model and how sure it is, and each chain alone where asked for, from the same start."""
-    fit(model, material, config.learning, watches(run, "joint"))
-    calibrate(model, material)
+def fit_baselines(material: list[Material], config: Config, run: RunLog) -> Cascade | None:
+    """Fits each chain alone where asked for, from the same start."""
+    if not config.compare_chains or config.model.chains != "joint":
+        return None
+    learning = replace(config, learning=config.staged)
+    return fit_cascade(material, learning, {method: watches(run, method) for method in ("matching", "clustering")})
+
+
+def decoders_of(model: JointScanCRF, cascade: Cascade | None) -> dict[str, Decoder]:
+    """What is evaluated: the model and, where it was fitted, each chain alone."""
     decoders: dict[str, Decoder] = {"joint": model}
-    if config.compare_chains and config.model.chains == "joint":
-        cascade = fit_cascade(material, config, {method: watches(run, method) for method in ("matching", "clustering")})
-        decoders["CRF-Matching"] = lambda batch, start: cascade.matching(batch, start.background_alone())
+    if cascade is not None:
+        matching = cascade.matching
+        decoders["CRF-Matching"] = lambda batch, start: matching(batch, start.background_alone())
         decoders["CRF-Clustering"] = cascade
     return decoders
 
@@ -121,18 +230,27 @@ def watches(run: RunLog, method: str) -> dict[str, Watch]:
 
 @torch.no_grad()
 def evaluate(
-    model: JointScanCRF, decoders: dict[str, Decoder], pairs: Sequence[ScanPair], batch_size: int
+    model: JointScanCRF, decoders: dict[str, Decoder], pairs: Sequence[ScanPair], batch_size: int, ranks: Ranks = ALONE
 ) -> tuple[dict[str, list[PairScore]], dict[str, list[PairPrediction]]]:
-    """Scores and answers of every method on the pairs, all from the start that `model` finds."""
-    answers: dict[str, list[PairPrediction]] = {method: [] for method in decoders}
+    """Scores and answers of every method on the pairs, all from the start that `model` finds.
+
+    Batches are dealt out to the processes; each of them returns everything.
+    """
+    found: dict[str, dict[int, PairPrediction]] = {method: {} for method in decoders}
     model.eval()
-    for k in tqdm(range(0, len(pairs), batch_size), desc="test", unit="batch", leave=False):
+    begins = range(0, len(pairs), batch_size)[ranks.rank :: ranks.world]
+    for k in tqdm(begins, desc="test", unit="batch", leave=False, disable=not ranks.is_first):
         part = pairs[k : k + batch_size]
         batch = ScanPairBatch.collate(part).without_truth()
         start = model.initialise(batch)
         for method, decode in decoders.items():
             prediction = decode(batch, start)
-            answers[method] += [prediction.pair(b, pair) for b, pair in enumerate(part)]
+            found[method] |= {k + b: prediction.pair(b, pair) for b, pair in enumerate(part)}
+    answers: dict[str, list[PairPrediction]] = {}
+    everyone = ranks.gather(found)
+    for method in decoders:
+        together = {k: answer for of_rank in everyone for k, answer in of_rank[method].items()}
+        answers[method] = [together[k] for k in range(len(pairs))]
     scores = {
         method: [score_pair(pair, answer) for pair, answer in zip(pairs, of_method, strict=True)]
         for method, of_method in answers.items()
@@ -157,9 +275,7 @@ def write_results(folder: Path, scores: dict[str, list[PairScore]], tables: Sequ
         "versions.json": json.dumps(versions(), indent=2) + "\n",
     }
     for name, content in contents.items():
-        temporary = folder / f".{name}.{os.getpid()}"
-        temporary.write_text(content)
-        os.replace(temporary, folder / name)
+        write_bytes(folder / name, content.encode())
 
 
 def versions() -> dict[str, str]:

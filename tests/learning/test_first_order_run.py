@@ -1,0 +1,170 @@
+"""`train.py` with first-order steps after the staged fit, from the command to its run folder; and settings that are refused."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_trainer import load_main
+
+from torchcrf_scan.commands.experiment import experiment
+from torchcrf_scan.config import AugmentConfig, Config, DataConfig, GradientConfig, LearningConfig, SimulatorConfig
+from torchcrf_scan.data.pair_file import write_pair
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.learning.checkpoint import Store
+from torchcrf_scan.learning.trainer import flatten, hold_out, load_data, load_weights, settings_of
+from torchcrf_scan.model import JointScanCRF
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Pair files of four sequences, coarse so that everything is quick."""
+    folder = tmp_path_factory.mktemp("pairs")
+    for k, pair in enumerate(simulate_pairs(SimulatorConfig(beams=61), 8, 4, 3)):
+        write_pair(folder / f"{pair.sequence}_{k}.npz", pair)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def arguments(pairs: Path) -> list[str]:
+    train, test = [f"{pairs}/sim3_{k}_*.npz" for k in (0, 1, 2)], f"{pairs}/sim3_3_*.npz"
+    return [
+        *(f"--data.train={json.dumps(train)}", f"--data.test={test}", "--data.simulate_train=[]", "--data.simulate_test=[]"),
+        *("--learning.folds=2", "--learning.max_steps=10", "--learning.booster_examples=500", "--learning.objective=unrolled"),
+        *("--model.features.stumps=4", "--model.inference.backend=eager", "--model.inference.clusters=4"),
+        *("--gradient.steps=2", "--gradient.batch_size=2", "--gradient.part=2", "--gradient.fresh=0", "--gradient.workers=0"),
+        *("--gradient.validate_every=1", "--gradient.graph=false", "--unrolled.iterations=2", "--compare_chains=false"),
+    ]
+
+
+@pytest.fixture(scope="module")
+def run(arguments: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "small"
+    load_main()([*arguments, f"--output={folder}"])
+    return folder
+
+
+def test_the_run_folder_has_a_checkpoint_and_the_training_events(run: Path) -> None:
+    names = {path.name for path in run.iterdir()}
+    assert {"config.yaml", "versions.json", "metrics.json", "model", "events", "training", "checkpoint.pt"} <= names
+    assert not any(name.startswith(".") for name in names)
+    events = EventAccumulator(str(run / "training"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("loss/total")] == [1, 2]
+    assert [event.step for event in events.Scalars("validation/total")] == [0, 1, 2]
+    metrics = json.loads((run / "metrics.json").read_text())
+    final = events.Scalars("final/cluster_accuracy")[0].value
+    assert final == pytest.approx(metrics["joint"]["cluster_accuracy"], rel=1e-5)
+
+
+def test_the_saved_model_is_the_best_of_the_looks(run: Path) -> None:
+    state = torch.load(run / "checkpoint.pt", weights_only=True)
+    model = JointScanCRF.from_pretrained(run / "model")
+    for name, weight in model.named_parameters():
+        assert torch.equal(weight, state["best"][name]), name
+    assert not torch.equal(state["model"]["association_weights.sequence"], torch.tensor(2.0))  # the staged fit came before
+
+
+def test_resuming_a_finished_run_changes_nothing(run: Path, arguments: list[str]) -> None:
+    before = (run / "model" / "model.safetensors").read_bytes(), (run / "metrics.json").read_bytes()
+    load_main()([*arguments, f"--output={run}", "--resume"])
+    assert ((run / "model" / "model.safetensors").read_bytes(), (run / "metrics.json").read_bytes()) == before
+
+
+def test_training_can_begin_from_a_saved_model(run: Path, arguments: list[str], tmp_path: Path) -> None:
+    load_main()([*arguments, f"--output={tmp_path}", f"--init={run / 'model'}", "--gradient.steps=1", "--gradient.validation=0"])
+    first = JointScanCRF.from_pretrained(run / "model")
+    moved = JointScanCRF.from_pretrained(tmp_path / "model")
+    assert torch.equal(moved.boosters.data.table, first.boosters.data.table)
+    assert torch.equal(moved.hypothesis_score.state_dict()["mean"], first.hypothesis_score.state_dict()["mean"])
+    assert not torch.equal(moved.association_weights["sequence"], first.association_weights["sequence"])
+
+
+def test_the_saved_config_is_read_again(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (run / "config.yaml").read_text()
+    assert "resume" not in text
+    assert "frame_rotation" in text
+    with pytest.raises(SystemExit):
+        load_main()([f"--config={run / 'config.yaml'}", "--gradient.steps=0"])
+    assert "gradient.steps: expected 1 or more, got 0" in capsys.readouterr().err
+
+
+def test_help_tells_of_every_setting(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        load_main()(["--help"])
+    text = capsys.readouterr().out
+    for name in flatten(Config()):
+        assert f"--{name} " in text, name
+    assert "--resume" in text
+    assert text.count("share of the highest learning rate") == 1  # a docstring's words
+
+
+# --- settings -----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("objective", "hinge", "expected one of none, pseudo_likelihood, unrolled, got hinge"),
+        ("device", "tpu", "expected one of auto, cpu, cuda, got tpu"),
+        ("worlds", ("moon",), "expected one of .*, got moon"),
+        ("worlds", (), "expected at least one"),
+        ("steps", 0, "expected 1 or more, got 0"),
+        ("part", 3, "expected a divisor of batch_size = 8, got 3"),
+        ("workers", -1, "expected 0 or more, got -1"),
+        ("learning_rate", 0.0, "expected more than 0, got 0.0"),
+        ("learning_rate", float("nan"), "expected more than 0, got nan"),
+        ("clip", float("nan"), "expected 0 or more, got nan"),
+        ("fresh", 1.5, r"expected a number in \[0.0, 1\], got 1.5"),
+        ("validation", 1.0, r"expected a share in \[0, 1\), got 1.0"),
+        ("seed", -1, "expected 0 or more, got -1"),
+    ],
+)
+def test_values_out_of_range_are_named(name: str, value: object, expected: str) -> None:
+    with pytest.raises(ValueError, match=rf"gradient\.{name}: {expected}"):
+        GradientConfig(**{name: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["mirror", "dropout", "noise", "frame_rotation", "frame_translation"])
+def test_augmentation_out_of_range_is_named(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"gradient\.augment\.{name}: expected .*, got -0.1"):
+        AugmentConfig(**{name: -0.1})
+
+
+def test_objectives_that_do_not_go_together_are_named() -> None:
+    with pytest.raises(ValueError, match=r"gradient\.objective: expected unrolled"):
+        Config(learning=LearningConfig(objective="unrolled"), gradient=GradientConfig(objective="pseudo_likelihood"))
+    with pytest.raises(ValueError, match=r"init: expected a gradient\.objective"):
+        Config(init="simulated")
+    assert Config().first_order == "none"
+    both = Config(learning=LearningConfig(objective="unrolled"))
+    assert (both.first_order, both.staged.objective) == ("unrolled", "pseudo_likelihood")
+    exact = Config(learning=LearningConfig(objective="likelihood"), gradient=GradientConfig(objective="unrolled"))
+    assert (exact.first_order, exact.staged.objective) == ("unrolled", "likelihood")
+
+
+def test_one_sequence_cannot_be_held_out_of_itself() -> None:
+    config = Config(data=DataConfig(pairs=2, sequences=1), gradient=GradientConfig(objective="unrolled"))
+    train, _ = load_data(config.data)
+    with pytest.raises(ValueError, match=r"gradient\.validation: .*at least 2 sequences"):
+        hold_out(train, config)
+    assert hold_out(train, Config(data=config.data)) == (train, [])
+
+
+def test_weights_of_other_features_are_refused(run: Path) -> None:
+    with pytest.raises(ValueError, match="init: expected a model with the features of"):
+        load_weights(JointScanCRF(), run / "model")
+
+
+def test_what_a_run_may_change_when_it_goes_on(tmp_path: Path) -> None:
+    before = settings_of(Config(output="a", gradient=GradientConfig(workers=1)))
+    assert before == settings_of(Config(output="b", compare_chains=False, gradient=GradientConfig(workers=3, checkpoint_every=1)))
+    Store(tmp_path, before).write(0, {"step": 0})
+    with pytest.raises(ValueError, match=r"learning\.seed"):
+        Store(tmp_path, settings_of(Config(learning=LearningConfig(seed=1)))).read()
+
+
+def test_an_experiment_fits_in_stages(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"gradient\.objective: expected none in an experiment, .* got unrolled"):
+        experiment(output=str(tmp_path), learning=LearningConfig(objective="unrolled"))

@@ -1,0 +1,220 @@
+"""First-order training: it learns, goes on after kill -9 as if nothing had been, and many processes descend as one does."""
+
+import json
+import logging
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import small_run
+import torch
+from torch import Tensor
+
+from torchcrf_scan.learning.checkpoint import NAME
+from torchcrf_scan.learning.gradient import Learner, has_amp
+from torchcrf_scan.learning.objectives import pseudo_likelihood
+from torchcrf_scan.learning.portions import Portion, as_portion
+from torchcrf_scan.learning.ranks import ALONE, Ranks
+from torchcrf_scan.model import JointScanCRF
+
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAM = [sys.executable, str(Path(small_run.__file__))]
+KILLED = -9
+
+
+def start(*arguments: str, launcher: tuple[str, ...] = ()) -> int:
+    """Return code of the small run as a program of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *launcher, *PROGRAM[1:], *arguments]
+    return subprocess.run(command, env=environment, cwd=ROOT, check=False, capture_output=True, timeout=500).returncode
+
+
+def assert_identical(a: Any, b: Any, where: str = "") -> None:
+    """Bit for bit the same, down to the optimiser's moments."""
+    assert type(a) is type(b), where
+    if isinstance(a, Tensor):
+        assert torch.equal(a, b), where
+    elif isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_identical(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b), where
+        for k, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_identical(x, y, f"{where}[{k}]")
+    else:
+        assert a == b, where
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nobody disturbed."""
+    folder = tmp_path_factory.mktemp("straight")
+    assert start(str(folder)) == 0
+    return folder
+
+
+def final(folder: Path) -> dict[str, Any]:
+    return torch.load(folder / "final.pt", weights_only=True)
+
+
+@pytest.mark.parametrize(
+    ("death", "reached"),
+    [(("--kill-after", "5"), 4), (("--kill-in-write", "4"), 2), (("--kill-after", "1", "--workers", "1"), 0)],
+)
+def test_killed_and_resumed_ends_bit_for_bit_the_same(death: tuple[str, ...], reached: int, straight: Path, tmp_path: Path) -> None:
+    """reached: step of the last checkpoint before the end."""
+    assert start(str(tmp_path), *death) == KILLED
+    assert not (tmp_path / "final.pt").exists()
+    assert start(str(tmp_path), "--resume") == 0
+    assert_identical(final(tmp_path), final(straight))
+    curves = [json.loads((folder / "curve.json").read_text()) for folder in (straight, tmp_path)]
+    rest = len(curves[1]["loss"])
+    assert rest == 6 - reached
+    assert curves[1]["loss"] == curves[0]["loss"][-rest:]
+
+
+def test_two_processes_have_the_loss_curve_of_one(straight: Path, tmp_path: Path) -> None:
+    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    assert start(str(tmp_path), launcher=launcher) == 0
+    one, two = (json.loads((folder / "curve.json").read_text()) for folder in (straight, tmp_path))
+    assert two["loss"] == pytest.approx(one["loss"], rel=1e-5)
+    assert [step for step, _ in two["validation"]] == [0, 2, 4, 6]
+    assert [loss for _, loss in two["validation"]] == pytest.approx([loss for _, loss in one["validation"]], rel=1e-5)
+
+
+@pytest.mark.parametrize("objective", ["pseudo_likelihood", "unrolled"])
+def test_the_validation_loss_falls_and_the_best_weights_are_kept(objective: str, tmp_path: Path) -> None:
+    config = small_run.small_config(objective=objective, steps=8, clip=0.0)
+    learner, watcher = small_run.run(tmp_path, config)
+    losses = dict(watcher.validations)
+    assert min(losses.values()) < losses[0]
+    assert learner.best is not None
+    assert learner.stopping.best == min(losses.values())
+    assert_identical(dict(learner.model.state_dict()), dict(learner.best))
+    assert all(math.isfinite(report.norm) and report.nodes > 0 and report.pairs == 4 for report in watcher.reports)
+    assert set(watcher.reports[0].norms) == {"association_weights", "clustering_weights"}
+    total = math.sqrt(sum(norm**2 for norm in watcher.reports[0].norms.values()))
+    assert watcher.reports[0].norm == pytest.approx(total)
+
+
+def test_it_stops_early_and_stays_stopped(tmp_path: Path) -> None:
+    config = small_run.small_config(steps=12, validate_every=1, patience=2, learning_rate=100.0, clip=0.0, warmup=0)
+    learner, _ = small_run.run(tmp_path, config)
+    assert learner.stopping.is_over
+    assert learner.step == learner.stopping.step + 2 < 12
+    again, watcher = small_run.run(tmp_path, config, resume=True)
+    assert (again.step, watcher.reports) == (learner.step, [])
+    assert_identical(dict(again.model.state_dict()), dict(learner.model.state_dict()))
+
+
+def test_without_validation_the_last_weights_are_kept(tmp_path: Path) -> None:
+    learner, watcher = small_run.run(tmp_path, small_run.small_config(steps=2, validation=0.0))
+    assert learner.best is None
+    assert watcher.validations == []
+    assert (tmp_path / NAME).exists()
+
+
+def test_a_disk_that_fills_up_does_not_stop_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, straight: Path
+) -> None:
+    calls = 0
+
+    def fsync(_: int) -> None:
+        nonlocal calls
+        calls += 1
+        if calls > 2:  # the first checkpoint: its content and its folder
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with caplog.at_level(logging.WARNING):
+        learner, _ = small_run.run(tmp_path, small_run.small_config())
+    assert "checkpoint of step 6 not written" in caplog.text
+    assert "that of step 0 is kept" in caplog.text
+    assert_identical(dict(learner.model.state_dict()), dict(final(straight)["model"]))
+    assert torch.load(tmp_path / NAME, weights_only=True)["step"] == 0
+
+
+def test_a_run_of_other_settings_is_not_gone_on_with(tmp_path: Path) -> None:
+    small_run.run(tmp_path, small_run.small_config(steps=1))
+    with pytest.raises(ValueError, match=r"got gradient\.steps = '2' after '1'"):
+        small_run.run(tmp_path, small_run.small_config(steps=2), resume=True)
+
+
+def test_parts_that_cannot_be_shared_out_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"gradient\.part: expected 4 / 2 parts to be shared out among 3 processes"):
+        small_run.run(tmp_path, small_run.small_config(), Ranks(0, 3))
+
+
+# --- one step -----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def learner() -> Learner:
+    config = small_run.small_config(batch_size=4, part=2, clip=0.5, warmup=0)
+    return Learner(JointScanCRF(config.model), config.gradient, ALONE)
+
+
+@pytest.fixture(scope="module")
+def portions() -> list[Portion]:
+    pairs, _ = small_run.small_pairs()
+    return [as_portion(pairs[:2]), as_portion(pairs[2:])]
+
+
+def test_parts_make_the_gradient_of_the_whole(learner: Learner, portions: list[Portion]) -> None:
+    pairs, _ = small_run.small_pairs()
+    whole = JointScanCRF(learner.model.config)
+    loss = pseudo_likelihood(whole, as_portion(pairs))["total"]
+    loss.backward()
+    squares = [float(weight.grad.square().sum()) for weight in whole.parameters() if weight.grad is not None]
+    report = learner.descend(pseudo_likelihood, iter(portions))
+    assert report.terms["total"] == pytest.approx(loss.item(), rel=1e-5)
+    assert report.norm == pytest.approx(math.sqrt(sum(squares)), rel=1e-4)
+    cut = [weight.grad for weight in learner.model.parameters()]
+    assert math.sqrt(sum(float(g.square().sum()) for g in cut if g is not None)) == pytest.approx(0.5, rel=1e-4)
+
+
+def test_a_gradient_that_is_not_finite_is_left_out(
+    learner: Learner, portions: list[Portion], caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(model: JointScanCRF, portion: Portion) -> dict[str, Tensor]:
+        return {"total": next(iter(model.parameters())) * math.nan}
+
+    before = {name: value.clone() for name, value in learner.model.state_dict().items()}
+    with caplog.at_level(logging.WARNING):
+        learner.descend(broken, iter(portions))
+    assert "step 1 left out: its gradient is not finite" in caplog.text
+    assert_identical(dict(learner.model.state_dict()), before)
+    assert learner.step == 1
+
+
+def test_a_loss_that_no_weight_has_a_part_in_moves_nothing(learner: Learner, portions: list[Portion]) -> None:
+    before = {name: value.clone() for name, value in learner.model.state_dict().items()}
+    report = learner.descend(lambda model, portion: {"total": torch.tensor(1.0)}, iter(portions))
+    assert (report.norm, report.terms) == (0.0, {"total": 1.0})
+    assert_identical(dict(learner.model.state_dict()), before)
+
+
+def test_a_cpu_calculates_in_full_precision(learner: Learner) -> None:
+    assert not has_amp(replace(learner.config, amp=True), torch.device("cpu"))
+
+
+def test_the_state_holds_everything(learner: Learner, portions: list[Portion]) -> None:
+    def forever() -> Iterator[Portion]:
+        while True:
+            yield from portions
+
+    learner.descend(pseudo_likelihood, forever())
+    learner.keep_best(1.0)
+    other = Learner(JointScanCRF(learner.model.config), learner.config, ALONE)
+    other.load_state_dict(learner.state_dict())
+    assert_identical(other.state_dict(), learner.state_dict())
+    reports = [of.descend(pseudo_likelihood, forever()) for of in (learner, other)]
+    assert reports[0].terms == reports[1].terms
+    assert_identical(other.state_dict(), learner.state_dict())

@@ -1,0 +1,128 @@
+"""Checkpoints that survive: written beside their place, flushed to the disk, moved there; whole or not at all."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import pickle
+import random
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+log = logging.getLogger(__name__)
+
+NAME = "checkpoint.pt"
+FORMAT = 1  # of what is written
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Replaces a file by new content in one step that a killed process or a full disk cannot leave half done.
+
+    Raises:
+        OSError: it could not be written; the file that was there still is.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)  # the new name too, not the content alone
+    finally:
+        os.close(folder)
+
+
+@dataclass(slots=True)
+class Store:
+    """The checkpoint of a run folder.
+
+    Attributes:
+        folder: the run folder. settings: by name, what a run that goes on must not change.
+        last: step of the last good checkpoint, None before the first.
+    """
+
+    folder: Path
+    settings: dict[str, Any]
+    last: int | None = None
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.folder / NAME
+
+    def write(self, step: int, state: dict[str, Any]) -> bool:
+        """Writes a checkpoint; where that fails says so, keeps the old one and returns False: training can go on without."""
+        content = io.BytesIO()
+        torch.save({"format": FORMAT, "settings": self.settings, "random": random_state(), **state}, content)
+        try:
+            write_bytes(self.path, content.getvalue())
+        except OSError as error:
+            kept = "there is none before it" if self.last is None else f"that of step {self.last} is kept"
+            log.warning("checkpoint of step %d not written, %s: %s", step, kept, error)
+            return False
+        self.last = step
+        return True
+
+    def read(self) -> dict[str, Any] | None:
+        """The last good checkpoint, None where there is none yet.
+
+        Raises:
+            ValueError: one of other settings, whose names it tells, or a file that is none.
+        """
+        for left in self.folder.glob(f".{NAME}.*"):  # of a process that was killed while it wrote
+            left.unlink()
+        if not self.path.exists():
+            return None
+        try:
+            state = torch.load(self.path, map_location="cpu", weights_only=True)
+            written, settings = state["format"], state["settings"]
+        except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
+            raise ValueError(f"resume: expected a checkpoint of this program, got {self.path}: {error}") from error
+        if written != FORMAT:
+            raise ValueError(f"resume: expected a checkpoint of format {FORMAT}, got {written}: {self.path}")
+        other = [name for name in self.settings if settings.get(name) != self.settings[name]]
+        if other:
+            told = ", ".join(f"{name} = {self.settings[name]!r} after {settings.get(name)!r}" for name in other[:5])
+            raise ValueError(f"resume: expected the settings of the run in {self.folder}, got {told}")
+        self.last = state["step"]
+        return dict(state)
+
+
+def random_state() -> dict[str, Any]:
+    """The states of all global generators, in types that are safe to load."""
+    words = np.random.get_state(legacy=False)
+    assert isinstance(words, dict)
+    version, numbers, spare = random.getstate()
+    state: dict[str, Any] = {
+        "torch": torch.get_rng_state(),
+        "numpy": {
+            **words,
+            "state": {"key": torch.from_numpy(words["state"]["key"].astype(np.int64)), "pos": words["state"]["pos"]},
+        },
+        "python": [version, list(numbers), spare],
+    }
+    if torch.cuda.is_available():
+        state["cuda"] = torch.cuda.get_rng_state_all()
+    return state
+
+
+def set_random_state(state: dict[str, Any]) -> None:
+    """Puts all global generators where they were."""
+    torch.set_rng_state(state["torch"])
+    words = state["numpy"]
+    np.random.set_state({**words, "state": {**words["state"], "key": words["state"]["key"].numpy().astype(np.uint32)}})
+    version, numbers, spare = state["python"]
+    random.setstate((version, tuple(numbers), spare))
+    if "cuda" in state and torch.cuda.is_available():
+        torch.cuda.set_rng_state_all(state["cuda"])

@@ -1,0 +1,88 @@
+"""The processes of one training run: alone, or those that `torchrun` started, on one machine or many."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import TypeVar, cast
+
+import torch
+from torch import Tensor, distributed, nn
+
+T = TypeVar("T")
+CPU = torch.device("cpu")
+PATIENCE = timedelta(hours=24)  # the others wait for the first one's staged fit
+
+
+@dataclass(frozen=True, slots=True)
+class Ranks:
+    """This process among all; `device` is where it calculates. Alone, nothing is sent anywhere."""
+
+    rank: int = 0
+    world: int = 1
+    device: torch.device = CPU
+
+    @property
+    def is_first(self) -> bool:
+        """Whether it is the one that writes."""
+        return self.rank == 0
+
+    def sum(self, values: Tensor) -> Tensor:
+        """The sum over all processes, the same in each of them."""
+        if self.world > 1:
+            distributed.all_reduce(values)
+        return values
+
+    def gather(self, value: T) -> list[T]:
+        """Every process's object, by rank."""
+        if self.world == 1:
+            return [value]
+        everyone: list[T | None] = [None] * self.world
+        distributed.all_gather_object(everyone, value)
+        return cast(list[T], everyone)
+
+    def share(self, value: T) -> T:
+        """The first process's object, in all of them."""
+        if self.world == 1:
+            return value
+        box = [value]
+        distributed.broadcast_object_list(box)
+        return box[0]
+
+    def share_weights(self, module: nn.Module) -> None:
+        """Gives every process the first one's parameters and buffers."""
+        state = {name: value.cpu() for name, value in module.state_dict().items()}
+        module.load_state_dict(self.share(state))
+
+
+ALONE = Ranks()
+
+
+@contextmanager
+def join(device: str = "auto", environment: Mapping[str, str] = os.environ) -> Iterator[Ranks]:
+    """Joins the processes that `torchrun` started, if it did, and leaves them in the end; nccl on GPUs, gloo on CPUs.
+
+    device: `auto`, `cpu` or `cuda`.
+
+    Raises:
+        ValueError: `cuda` where there is none.
+    """
+    has_gpu = torch.cuda.is_available()
+    if device == "cuda" and not has_gpu:
+        raise ValueError("gradient.device: expected cpu or auto on a machine without a GPU, got cuda")
+    on_gpu = has_gpu and device != "cpu"
+    place = torch.device("cuda", int(environment.get("LOCAL_RANK", 0))) if on_gpu else torch.device("cpu")
+    world = int(environment.get("WORLD_SIZE", 1))
+    if world == 1:
+        yield Ranks(device=place)
+        return
+    if on_gpu:
+        torch.cuda.set_device(place)
+    distributed.init_process_group("nccl" if on_gpu else "gloo", timeout=PATIENCE)
+    try:
+        yield Ranks(distributed.get_rank(), world, place)
+    finally:
+        distributed.destroy_process_group()
