@@ -12,6 +12,7 @@ from support import assert_close, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan import ClusteringCRF, ExtraLogUnary, FeatureConfig, InferenceConfig, JointScanCRF, MatchingCRF, ModelConfig
+from torchcrf_scan.backend import is_numba_installed
 from torchcrf_scan.batch import Prediction, ScanPairBatch
 from torchcrf_scan.features.learned import Embeddings
 from torchcrf_scan.geometry import se2
@@ -303,11 +304,11 @@ def test_flooding_does_not_take_them() -> None:
         make_model(schedule="flooding")(batch, start, extra_log_unary=logits(1.0))
 
 
-def test_compiled_code_does_not_take_them_and_says_so() -> None:
+def test_compiled_code_does_not_take_embeddings_and_says_so() -> None:
     batch, start = scene()
-    settings_ = {"backend": "compiled", "motion_weights": "hard"}
-    with torch.no_grad(), pytest.raises(ValueError, match=r"backend: expected for compiled .* extra_log_unary"):
-        make_model(**settings_)(batch, start, extra_log_unary=logits(1.0))
+    settings_ = {"backend": "compiled", "motion_weights": "hard", "embedding": "dot"}
+    with torch.no_grad(), pytest.raises(ValueError, match=r"backend: expected for compiled no embeddings"):
+        make_model(**settings_)(batch, start, **embeddings())
     smooth = JointScanCRF(ModelConfig(features=FeatureConfig(smooth=0.1), inference=InferenceConfig(backend="compiled")))
     with torch.no_grad(), pytest.raises(ValueError, match=r"backend: expected for compiled .* smooth: 0\.1"):
         smooth(batch, start)
@@ -315,10 +316,25 @@ def test_compiled_code_does_not_take_them_and_says_so() -> None:
 
 def test_where_compiled_code_would_answer_tensors_do() -> None:
     batch, start = scene()
-    own = {"motion_weights": "hard", "stop_early": True, "iterations": 5}
+    own = {"motion_weights": "hard", "stop_early": True, "iterations": 5, "embedding": "dot"}
     with torch.no_grad():
-        found = make_model(backend="auto", **own)(batch, start, extra_log_unary=logits(0.3, 0.2))
-        assert_identical(found, make_model(**own)(batch, start, extra_log_unary=logits(0.3, 0.2)))
+        assert_identical(
+            make_model(backend="auto", **own)(batch, start, **embeddings()), make_model(**own)(batch, start, **embeddings())
+        )
+
+
+@pytest.mark.skipif(not is_numba_installed(), reason="needs numba, the extra fast")
+@torch.no_grad()
+def test_compiled_code_takes_log_potentials() -> None:
+    batch, start = scene()
+    own = {"motion_weights": "hard", "stop_early": True, "iterations": 5}
+    given = logits(0.3, 0.2)
+    compiled, eager = (make_model(backend=backend, **own)(batch, start, extra_log_unary=given) for backend in ("compiled", "eager"))
+    plain = make_model(backend="compiled", **own)(batch, start)
+    assert torch.equal(compiled.cluster, eager.cluster)
+    assert_close(compiled.log_cluster, eager.log_cluster, tolerance=1e-6)
+    assert_close(compiled.log_association, eager.log_association, tolerance=1e-6)
+    assert not torch.allclose(compiled.log_cluster, plain.log_cluster)
 
 
 # --- saving -------------------------------------------------------------------------------------------------------------------

@@ -35,10 +35,10 @@ def can_search(backend: str, points: Tensor) -> bool:
     return _decide(backend, _why_not_here(points))
 
 
-def can_decode(model: ModelConfig, points: Tensor, *, needs_gradient: bool, has_learned_inputs: bool = False) -> bool:
+def can_decode(model: ModelConfig, points: Tensor, *, needs_gradient: bool, has_embeddings: bool = False) -> bool:
     """Whether compiled code decodes a model; arguments and errors as in `can_search`.
 
-    has_learned_inputs: embeddings or extra log potentials were given.
+    has_embeddings: some were given, or the model's encoder makes them.
     """
     inference = model.inference
     chosen = {name: getattr(inference if hasattr(inference, name) else model, name) for name in COMPILED_SETTINGS}
@@ -48,8 +48,8 @@ def can_decode(model: ModelConfig, points: Tensor, *, needs_gradient: bool, has_
         unknown.append(f"smooth: {model.features.smooth}")
     if unknown:
         reason = f"settings that it knows, got {', '.join(unknown)}"
-    elif has_learned_inputs:
-        reason = "scans alone, got embeddings or extra_log_unary (backend eager or auto takes them)"
+    elif has_embeddings:
+        reason = "no embeddings, got some (backend eager or auto takes them)"
     elif needs_gradient:
         reason = "no gradient to be asked for (torch.no_grad)"
     return _decide(inference.backend, reason)

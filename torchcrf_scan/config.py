@@ -209,6 +209,27 @@ class FeatureConfig:
 
 
 @dataclass(frozen=True)
+class EncoderConfig:
+    """A convolutional encoder of the scans' points (`torchcrf_scan.encoder`), part of the model and learned with it.
+
+    Attributes:
+        width: channels of its layers; 0: the model has no encoder.
+        dilations: points between the taps of each layer; twice their sum is how far it sees along a scan.
+        embedding: channels of the embeddings it makes beside its log potentials, which needs `features.embedding`; 0: none.
+    """
+
+    width: int = 0
+    dilations: tuple[int, ...] = (1, 2, 4, 8, 16)
+    embedding: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("width", "embedding"):
+            _within(f"encoder.{name}", getattr(self, name), 0, math.inf)
+        for dilation in self.dilations:
+            _within("encoder.dilations", dilation, 1, math.inf)
+
+
+@dataclass(frozen=True)
 class ModelConfig:
     """Everything that `save_pretrained` writes beside the weights.
 
@@ -217,6 +238,7 @@ class ModelConfig:
         coupling: of the joint chains: `motions` (the paper's) or `lattice`: both labels of a point are decided at once (spec 7.7).
         start: `search` (hypotheses over the whole scene), `paper` (spec 7.3: association chain, then runs of residuals) or `points`
             (the same chain, then one cluster a point, of which the vacuous ones are discarded).
+        encoder: of the scans' points; by default there is none.
     """
 
     chains: str = "joint"
@@ -224,8 +246,13 @@ class ModelConfig:
     start: str = "search"
     features: FeatureConfig = field(default_factory=FeatureConfig)
     inference: InferenceConfig = field(default_factory=InferenceConfig)
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
 
     def __post_init__(self) -> None:
+        if self.encoder.width > 0 and self.inference.schedule == "flooding":
+            raise ValueError("schedule: expected sweep for a model with an encoder, got flooding")
+        if self.encoder.embedding > 0 and self.features.embedding == "none":
+            raise ValueError("features.embedding: expected dot or cosine for an encoder that makes embeddings, got none")
         _choose("chains", self.chains, ("joint", "matching", "clustering"))
         _choose("coupling", self.coupling, ("motions", "lattice"))
         _choose("start", self.start, ("search", "paper", "points"))
@@ -354,8 +381,8 @@ class GradientConfig:
     """First-order training, which goes on from the staged fit or from `init`: AdamW on pairs that are generated on the fly.
 
     Attributes:
-        objective: loss of the steps: `pseudo_likelihood` or `unrolled`; `none`: no steps, the staged fit is all. With
-            `learning.objective` unrolled it is `unrolled`.
+        objective: loss of the steps: `pseudo_likelihood`, `likelihood` (exact, of each chain at the start's motions) or
+            `unrolled`; `none`: no steps, the staged fit is all. With `learning.objective` unrolled it is `unrolled`.
         steps: optimiser's steps at most.
         batch_size: pairs of a step, of all processes together.
         part: pairs that are looked at at once; a step's parts are shared out among the processes. Divides `batch_size`.
@@ -401,7 +428,7 @@ class GradientConfig:
     augment: AugmentConfig = field(default_factory=AugmentConfig)
 
     def __post_init__(self) -> None:
-        _choose("gradient.objective", self.objective, ("none", "pseudo_likelihood", "unrolled"))
+        _choose("gradient.objective", self.objective, ("none", "pseudo_likelihood", "likelihood", "unrolled"))
         _choose("gradient.device", self.device, ("auto", "cpu", "cuda"))
         for world in self.worlds:
             _choose("gradient.worlds", world, tuple(WORLDS))
@@ -515,14 +542,15 @@ class Config:
     init: str = ""
 
     def __post_init__(self) -> None:
-        if self.learning.objective == "unrolled" and self.gradient.objective == "pseudo_likelihood":
-            raise ValueError("gradient.objective: expected unrolled with learning.objective unrolled, got pseudo_likelihood")
+        if self.learning.objective == "unrolled" and self.gradient.objective not in ("none", "unrolled"):
+            got = self.gradient.objective
+            raise ValueError(f"gradient.objective: expected unrolled with learning.objective unrolled, got {got}")
         if self.init and self.first_order == "none":
             raise ValueError(f"init: expected a gradient.objective to go on with from {self.init}, got none")
 
     @property
     def first_order(self) -> str:
-        """The loss of first-order training: `none`, `pseudo_likelihood` or `unrolled`."""
+        """The loss of first-order training: `none`, or one of `GradientConfig.objective`."""
         return "unrolled" if self.learning.objective == "unrolled" else self.gradient.objective
 
     @property

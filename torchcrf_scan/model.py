@@ -16,7 +16,8 @@ from torch import Tensor, nn
 
 from torchcrf_scan.backend import can_decode, can_search
 from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
-from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.config import EncoderConfig, FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.encoder.encoder import ScanEncoder
 from torchcrf_scan.features.learned import EMBEDDING_WEIGHTS, Embeddings, ExtraLogUnary, LearnedInputs
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales, has_weight, live_weights
@@ -65,6 +66,7 @@ class JointScanCRF(nn.Module):
         self.hypothesis_score = HypothesisScore()
         self.calibration = Calibration()
         self.cluster_potential = ClusterPotential()
+        self.encoder = ScanEncoder(self.config.encoder) if self.config.encoder.width > 0 else None
         self.reset_parameters()
 
     def _zeros(self, chain: str, names: Sequence[str]) -> nn.ParameterDict:
@@ -113,13 +115,24 @@ class JointScanCRF(nn.Module):
     def learned_inputs(
         self,
         batch: ScanPairBatch,
+        start: Start | None = None,
         *,
         source_embedding: Tensor | None = None,
         target_embedding: Tensor | None = None,
         extra_log_unary: ExtraLogUnary | None = None,
     ) -> LearnedInputs | None:
-        """The optional inputs of `forward`, checked; None where there are none."""
+        """The optional inputs of `forward`, checked, with what the encoder says of the batch; None where there are none.
+
+        start: motions that the encoder is to see the batch under; None: it is not asked.
+        """
         extra = extra_log_unary or ExtraLogUnary()
+        if self.encoder is not None and start is not None:
+            encoded = self.encoder(batch, start, self.config.inference.backend)
+            extra = extra.plus(encoded.extra)
+            if encoded.source_embedding is not None:
+                if source_embedding is not None or target_embedding is not None:
+                    raise ValueError("source_embedding: expected none for a model whose encoder makes embeddings, got one")
+                source_embedding, target_embedding = encoded.source_embedding, encoded.target_embedding
         given = {"source_embedding": source_embedding, "target_embedding": target_embedding}
         given |= {"extra_log_unary.outlier": extra.outlier, "extra_log_unary.moving": extra.moving}
         if all(value is None for value in given.values()):
@@ -181,11 +194,13 @@ class JointScanCRF(nn.Module):
                 ones are associated. The start is looked for without them. None: as if the model knew none.
             extra_log_unary: (B, N) learned log potentials of outliers and of moving points.
         """
+        if self.encoder is not None:
+            start = start or self.initialise(batch)
         learned = self.learned_inputs(
-            batch, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
+            batch, start, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
         )
-        if self._is_compiled(batch, has_learned_inputs=learned is not None):
-            return self._predict_compiled(batch, start)
+        if self._is_compiled(batch, learned):
+            return self._predict_compiled(batch, start, learned)
         start = start or self.initialise(batch)
         view = self.view(batch, learned)
         schedule = {"sweep": joint.decode, "flooding": flooding.decode}[self.config.inference.schedule]
@@ -193,20 +208,23 @@ class JointScanCRF(nn.Module):
         uncertainty = prediction.uncertainty and prediction.uncertainty.scaled(1 / view.factor)
         return replace(prediction, motions=scale_motions(prediction.motions, 1 / view.factor), uncertainty=uncertainty)
 
-    def _is_compiled(self, batch: ScanPairBatch, *, has_learned_inputs: bool = False) -> bool:
+    def _is_compiled(self, batch: ScanPairBatch, learned: LearnedInputs | None) -> bool:
         """Whether compiled code answers: there is no gradient to follow, and no scan is empty, which is left to tensors."""
-        tensors = (*self.parameters(), batch.source, batch.target, batch.initial_motion)
-        needs_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-        is_possible = can_decode(self.config, batch.source, needs_gradient=needs_gradient, has_learned_inputs=has_learned_inputs)
+        extra = () if learned is None else (learned.outlier, learned.moving)
+        tensors = (*self.parameters(), batch.source, batch.target, batch.initial_motion, *extra)
+        needs_gradient = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
+        has_embeddings = learned is not None and learned.embeddings is not None
+        is_possible = can_decode(self.config, batch.source, needs_gradient=needs_gradient, has_embeddings=has_embeddings)
         return is_possible and bool(batch.source_mask[:, :1].all() and batch.target_mask[:, :1].all())
 
-    def _predict_compiled(self, batch: ScanPairBatch, start: Start | None) -> Prediction:
+    def _predict_compiled(self, batch: ScanPairBatch, start: Start | None, learned_inputs: LearnedInputs | None) -> Prediction:
         from torchcrf_scan.compiled import decode, movers, pair
 
         if start is None and self.config.start != "search":
             start = self.initialise(batch)
         score, learned = movers.score_of(self.hypothesis_score), decode.learned_of(self.fitted)
-        return pair.predict(batch, start, score, learned, decode.settings_of(self.config), self.config.inference.clusters)
+        settings, states = decode.settings_of(self.config), self.config.inference.clusters
+        return pair.predict(batch, start, score, learned, settings, states, learned_inputs)
 
     def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
         """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.
@@ -284,9 +302,13 @@ class JointScanCRF(nn.Module):
             config = replace(config, features=replace(config.features, **features))
         model = cls(config)
         saved = load((folder / "model.safetensors").read_bytes())
-        fresh = {name: value for name, value in model.state_dict().items() if name.rpartition(".")[2] in EMBEDDING_WEIGHTS}
-        model.load_state_dict({**fresh, **saved} if features else saved)
+        model.load_state_dict({**model.embedding_state, **saved} if features else saved)
         return model.eval()
+
+    @property
+    def embedding_state(self) -> dict[str, Tensor]:
+        """The part of the model's state that another without embeddings has not."""
+        return {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in EMBEDDING_WEIGHTS}
 
 
 class MatchingCRF(JointScanCRF):
@@ -306,10 +328,16 @@ class ClusteringCRF(JointScanCRF):
 def model_config(values: dict[str, Any]) -> ModelConfig:
     """The config that `asdict` made into a dictionary."""
     return ModelConfig(
-        **{k: v for k, v in values.items() if k not in ("features", "inference")},
+        **{k: v for k, v in values.items() if k not in ("features", "inference", "encoder")},
         features=FeatureConfig(**{**values["features"], "left_out": tuple(values["features"].get("left_out", ()))}),
         inference=InferenceConfig(**values["inference"]),
+        encoder=encoder_config(values.get("encoder", {})),
     )
+
+
+def encoder_config(values: dict[str, Any]) -> EncoderConfig:
+    """The config that `asdict` made into a dictionary; none of models that were saved before there were encoders."""
+    return EncoderConfig(**{**values, "dilations": tuple(values["dilations"])}) if values else EncoderConfig()
 
 
 def find_weights(name_or_path: str | Path) -> Path:

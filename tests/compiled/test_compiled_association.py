@@ -90,7 +90,7 @@ def assert_same_round(batch: ScanPairBatch, parameters: Parameters, count: int =
         seen = array(sight.seen_through[0]), array(sight.hidden[0])
         log_unary, log_pairwise, expected = eager(view, parameters, index, mask, moved)
         work = work or association.workspace(*index.shape)
-        log_association, labels = association.associate(model, pair, work, index, mask, found, *seen)
+        log_association, labels = association.associate(model, pair, work, index, mask, found, *seen, np.zeros(N))
         ours = association.log_unary_of(model, pair, work, found, *seen)
         np.testing.assert_allclose(ours, log_unary, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(association.log_pairwise_of(model, pair, index), log_pairwise, rtol=1e-9, atol=1e-9)
@@ -165,11 +165,11 @@ def test_candidates_that_are_not_real() -> None:
     model = association.association_model(parameters)
     sight = look(view.target_sweep, view.batch.source)
     found, labels = association.associate(
-        model, pair, work, index, mask, source, array(sight.seen_through[0]), array(sight.hidden[0])
+        model, pair, work, index, mask, source, array(sight.seen_through[0]), array(sight.hidden[0]), none
     )
     np.testing.assert_allclose(found, eager(view, parameters, *given)[2], rtol=1e-9, atol=1e-9)
     assert labels[7] == -1
-    assert np.isfinite(association.associate(model, pair, work, index, mask, source, none, none)[0][mask.all(1)]).all()
+    assert np.isfinite(association.associate(model, pair, work, index, mask, source, none, none, none)[0][mask.all(1)]).all()
 
 
 def test_without_candidates_everything_is_an_outlier() -> None:
@@ -177,6 +177,6 @@ def test_without_candidates_everything_is_an_outlier() -> None:
     pair = association.association_pair(source, target, shape.describe(source, False), shape.describe(target, False), np.zeros(3))
     index, mask = np.empty((3, 0), np.int64), np.empty((3, 0), np.bool_)
     model, work = association.association_model(layer().fitted), association.workspace(3, 0)
-    log_association, labels = association.associate(model, pair, work, index, mask, source, np.zeros(3), np.ones(3))
+    log_association, labels = association.associate(model, pair, work, index, mask, source, np.zeros(3), np.ones(3), np.zeros(3))
     assert log_association.tolist() == [[0.0]] * 3
     assert labels.tolist() == [-1] * 3

@@ -440,6 +440,7 @@ def associate(
     moved: Array,
     seen_through: Array,
     hidden: Array,
+    extra: Array,
 ) -> tuple[Array, Integers]:
     """An exact pass over the chain, every point moved by its cluster's motion (`inference.joint.update_association`).
 
@@ -447,12 +448,15 @@ def associate(
         work: of the same N and K; the same one for all rounds of a pair.
         index, mask: (N, K) candidates, real ones first and ascending.
         moved: (N, 2) source points under their own motion. seen_through, hidden: (N,) what the target's beams say of them.
+        extra: (N,) learned log potential of the outlier.
 
     Returns:
         (N, K+1) log-beliefs, the outlier last, and (N,) labels: target point or -1.
     """
     update_static(model, pair, work, index, mask)
     log_unary = log_unary_of(model, pair, work, moved, seen_through, hidden)
+    for i in range(len(extra)):
+        log_unary[i, -1] += extra[i]
     if model.weights[STRETCH] == 0 and model.weights[SHIFT] == 0:
         log_association = beliefs_in_sequence(log_unary, index, model.weights[SEQUENCE], *_touching_outlier(model))
     else:

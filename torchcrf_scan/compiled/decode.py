@@ -36,6 +36,7 @@ from torchcrf_scan.compiled.shape import describe, resolution
 from torchcrf_scan.compiled.start import Start as PairStart
 from torchcrf_scan.compiled.uncertainty import association_confidence, cluster_confidence, motion_covariance
 from torchcrf_scan.config import ModelConfig
+from torchcrf_scan.features.learned import LearnedInputs
 from torchcrf_scan.features.potentials import REFERENCE_UNIT
 from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.joint import MERGE_ROTATION, ROBUST_SHARE, SELECTION_ROUNDS, Parameters
@@ -77,6 +78,7 @@ class Pair(NamedTuple):
 
     Attributes:
         source: (N, 2). target: (M, 2). noise: `range_noise`. initial_motion: (3,). target_origin: (2,).
+        outlier, moving: (N,) of `features.learned.ExtraLogUnary`, 0 where there is nothing extra.
     """
 
     source: Array
@@ -86,6 +88,8 @@ class Pair(NamedTuple):
     noise: float
     initial_motion: Array
     target_origin: Array
+    outlier: Array
+    moving: Array
 
 
 class Decoded(NamedTuple):
@@ -119,6 +123,7 @@ class Scene(NamedTuple):
     Attributes:
         factor: that unit's on metres. source: (N, 2), target: (M, 2). noise: of a return.
         tangents: (M, 2) of the target. reach: (N, C).
+        outlier, moving: (N,) log potentials of `features.learned.ExtraLogUnary`.
     """
 
     factor: float
@@ -131,6 +136,8 @@ class Scene(NamedTuple):
     descriptors: AssociationPair
     tangents: Array
     reach: Booleans
+    outlier: Array
+    moving: Array
 
 
 class State(NamedTuple):
@@ -186,9 +193,10 @@ def array_of(values: torch.Tensor) -> Array:
     return np.ascontiguousarray(values.detach().cpu().double().numpy())
 
 
-def pair_of(batch: ScanPairBatch, b: int) -> Pair:
-    """Pair b without its padding."""
+def pair_of(batch: ScanPairBatch, b: int, learned: LearnedInputs | None = None) -> Pair:
+    """Pair b without its padding. learned: without embeddings."""
     n, m = int(batch.source_mask[b].sum()), int(batch.target_mask[b].sum())
+    extra = (None, None) if learned is None else (learned.outlier, learned.moving)
     return Pair(
         array_of(batch.source[b, :n]),
         array_of(batch.target[b, :m]),
@@ -197,6 +205,7 @@ def pair_of(batch: ScanPairBatch, b: int) -> Pair:
         float(batch.range_noise[b]),
         array_of(batch.initial_motion[b]),
         array_of(batch.target_origin[b]),
+        *(np.zeros(n) if of is None else array_of(of[b, :n]) for of in extra),
     )
 
 
@@ -248,14 +257,15 @@ def scene_of(pair: Pair, start: PairStart, settings: Settings) -> Scene:
     source_sweep = sweep_of(source, noise, source_closed, np.zeros(2))
     target_sweep = sweep_of(target, noise, target_closed, origin)
     boxes = boxes_of(target)
-    return Scene(factor, source, target, noise, boxes, source_sweep, target_sweep, descriptors, start.target_tangents, start.reach)
+    given = start.target_tangents, start.reach, pair.outlier, pair.moving
+    return Scene(factor, source, target, noise, boxes, source_sweep, target_sweep, descriptors, *given)
 
 
 @kernel
 def tables_of(scene: Scene, state: State, model: ClusteringModel) -> Tables:
     """The clustering chain at a round's motions and associations."""
     nearest = nearest_to_outliers(scene.boxes, scene.source, state.motions, state.active, state.association)
-    return tabulate(
+    tables = tabulate(
         scene.source,
         scene.target,
         scene.source_sweep,
@@ -267,6 +277,11 @@ def tables_of(scene: Scene, state: State, model: ClusteringModel) -> Tables:
         nearest,
         model,
     )
+    for i in range(len(scene.source)):
+        tables.log_outlier[i] += scene.outlier[i]
+        for c in range(1, len(state.motions)):
+            tables.log_inlier[c, i] += scene.moving[i]
+    return tables
 
 
 @kernel
@@ -360,7 +375,9 @@ def step(scene: Scene, state: State, tables: Tables, kept: Kept, work: Workspace
     motions = refit(scene, state, labels, state.motions, learned, settings)
     moved = registered_points(scene.source, motions, state.active, log_cluster)
     seen_through, hidden = look_at_all(scene.target_sweep, moved)
-    log_association, association = associate(learned.association, scene.descriptors, work, index, mask, moved, seen_through, hidden)
+    log_association, association = associate(
+        learned.association, scene.descriptors, work, index, mask, moved, seen_through, hidden, scene.outlier
+    )
     active, empty_for = state.active.copy(), state.empty_for.copy()
     after = State(motions, active, empty_for, association, labels, index, log_association, log_cluster)
     motions[:] = refit(scene, after, labels, motions, learned, settings)

@@ -22,7 +22,7 @@ Booleans = NDArray[np.bool_]
 
 SAFE_MATH = {"reassoc", "contract", "nsz", "arcp"}  # not those that assume finite numbers: impossible states are -inf
 PACKAGE = Path(__file__).parents[1]
-SOURCES = ("compiled", "features", "inference")  # whose code and constants are compiled
+SOURCES = ("compiled", "encoder", "features", "inference")  # whose code and constants are compiled
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcrf_scan.batch import Prediction, ScanPairBatch
-from torchcrf_scan.compiled import decode
+from torchcrf_scan.compiled import aligned, decode
 from torchcrf_scan.compiled.background import follow
 from torchcrf_scan.compiled.decode import Decoded, Learned, Pair, PairStart, Settings
 from torchcrf_scan.compiled.field import Field
@@ -25,6 +25,7 @@ from torchcrf_scan.compiled.movers import Score
 from torchcrf_scan.compiled.search import alone, find_background
 from torchcrf_scan.compiled.survey import Surveyed, fields_of, start_at, survey_at
 from torchcrf_scan.compiled.threads import for_each, in_parts
+from torchcrf_scan.features.learned import LearnedInputs
 from torchcrf_scan.inference import hypotheses as eager_hypotheses
 from torchcrf_scan.inference import initialise as eager
 from torchcrf_scan.inference import surface as eager_surface
@@ -83,16 +84,22 @@ def start_pair(batch: ScanPairBatch, b: int, score: Score, clusters: int, share:
 
 
 def predict(
-    batch: ScanPairBatch, start: Start | None, score: Score, learned: Learned, settings: Settings, states: int
+    batch: ScanPairBatch,
+    start: Start | None,
+    score: Score,
+    learned: Learned,
+    settings: Settings,
+    states: int,
+    inputs: LearnedInputs | None = None,
 ) -> Prediction:
     """`JointScanCRF.forward`: labels, motions and beliefs of every pair.
 
     Args:
-        start: motions to begin with; looked for where absent. states: D.
+        start: motions to begin with; looked for where absent. states: D. inputs: without embeddings.
     """
 
     def answer(b: int, share: Callable) -> Decoded:
-        pair = decode.pair_of(batch, b)
+        pair = decode.pair_of(batch, b, inputs)
         if start is None:
             own = start_pair(batch, b, score, states - 1, share)
         else:
@@ -100,6 +107,21 @@ def predict(
         return decode.decode_pair(pair, own, learned, settings)
 
     return _together(_of_pairs(answer, len(batch)), batch)
+
+
+def aligned_inputs(batch: ScanPairBatch, start: Start, *, both: bool = True) -> tuple[Tensor, ...]:
+    """`encoder.aligned.aligned_inputs`."""
+
+    def look(b: int, _: Callable) -> list[Array]:
+        pair = decode.pair_of(batch, b)
+        own = decode.start_of(start, b, len(pair.source), len(pair.target))
+        log_odds = own.log_odds if len(own.log_odds) else np.where(own.active, np.inf, -np.inf)
+        sides = (False, True) if both else (False,)
+        return [aligned.channels_of_side(pair, own.motions, log_odds, own.reach, is_target) for is_target in sides]
+
+    found = _of_pairs(look, len(batch))
+    lengths = batch.source.shape[1], batch.target.shape[1]
+    return tuple(_padded([of[k] for of in found], (lengths[k], aligned.WIDTH), 0.0).to(batch.source) for k in range(1 + both))
 
 
 def _of_pairs(function: Callable[[int, Callable], T], count: int) -> list[T]:

@@ -58,6 +58,12 @@ def rising_turn(difference: Tensor) -> Tensor:
     return ((difference + BACKWARDS) % (2 * math.pi) - BACKWARDS).clamp(min=0)
 
 
+def bearing_in(scan: Sweep, arms: Tensor) -> Tensor:
+    """(B, P) directions of arms (B, P, 2) from the sensor, as numbers on the scale of the scan's rising bearings."""
+    first, half = scan.bearings[:, :1].nan_to_num(posinf=0.0), scan.step[:, None] / 2
+    return first + (torch.atan2(arms[..., 1], arms[..., 0]) - first + half) % (2 * math.pi) - half
+
+
 @dataclass(frozen=True, slots=True)
 class FreeSpace:
     """How far beams contradict points and hide them, each from 0 (not) to 1 (clearly).
@@ -78,8 +84,7 @@ def look(scan: Sweep, points: Tensor) -> FreeSpace:
     ranges = torch.linalg.vector_norm(arms, dim=-1)
     with torch.no_grad():
         step, half = scan.step[:, None], scan.step[:, None] / 2
-        first = scan.bearings[:, :1].nan_to_num(posinf=0.0)
-        bearing = first + (torch.atan2(arms[..., 1], arms[..., 0]) - first + half) % (2 * math.pi) - half
+        bearing = bearing_in(scan, arms)
         last = (scan.count[:, None] - 1).clamp(min=0)
         after = torch.searchsorted(scan.bearings, bearing.contiguous())
         is_closed = scan.closed[:, None]

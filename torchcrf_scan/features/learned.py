@@ -34,6 +34,10 @@ class ExtraLogUnary:
     outlier: Tensor | None = None
     moving: Tensor | None = None
 
+    def plus(self, other: ExtraLogUnary) -> ExtraLogUnary:
+        """Both together."""
+        return ExtraLogUnary(_sum(self.outlier, other.outlier), _sum(self.moving, other.moving))
+
 
 @dataclass(frozen=True, slots=True)
 class Embeddings:
@@ -105,6 +109,10 @@ class LearnedInputs:
         """A tensor of the right dtype and device, (B, N) where there are extra log potentials."""
         given = (self.outlier, self.moving, None if self.embeddings is None else self.embeddings.source)
         return next(value for value in given if value is not None)
+
+
+def _sum(one: Tensor | None, other: Tensor | None) -> Tensor | None:
+    return one if other is None else other if one is None else one + other
 
 
 def add_log(log_unary: Tensor, extra: Tensor | None) -> Tensor:

@@ -18,6 +18,7 @@ from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features import candidates as candidate_search
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.association import pairwise_features
+from torchcrf_scan.features.learned import add_log, association_extra, clustering_extra
 from torchcrf_scan.features.potentials import (
     AssociationStates,
     Boosters,
@@ -62,16 +63,18 @@ class Design:
 
     Attributes:
         features: (B, N, S, W). mask: (B, N, S) possible states. label: (B, N) true state. known: (B, N) nodes that count.
+        extra: (B, N, S) log potentials that are not of the weights, as a larger network gives them; None: none.
     """
 
     features: Tensor
     mask: Tensor
     label: Tensor
     known: Tensor
+    extra: Tensor | None = None
 
     def log_likelihood(self, weights: Tensor) -> Tensor:
         """(B, N) log p(true state | neighbours, observation); 0 where nobody knows. weights: (W,)."""
-        score = (self.features @ weights).masked_fill(~self.mask, -torch.inf)
+        score = add_log(self.features @ weights, self.extra).masked_fill(~self.mask, -torch.inf)
         chosen = torch.log_softmax(score, dim=-1).gather(-1, self.label[..., None])[..., 0]
         return torch.where(self.known, chosen, torch.zeros_like(chosen))
 
@@ -83,6 +86,7 @@ class Chain:
     Attributes:
         unary: (B, N, S, U), pairwise: (B, N-1, S, S, P) features; their weights are U + P.
         mask: (B, N, S) possible states. label: (B, N) true state. known: (B, N) nodes that count; the others cut the chain.
+        extra: as in `Design`.
         axes, labels: the tensors' axes after B (n nodes, e edges, s states), and which states a label counts; for stacking.
     """
 
@@ -94,16 +98,17 @@ class Chain:
     mask: Tensor
     label: Tensor
     known: Tensor
+    extra: Tensor | None = None
 
     def design(self) -> Design:
         """The features that pseudo-likelihood needs."""
         features = torch.cat([self.unary, at_true_neighbours(self.pairwise, self.label, self.known)], dim=-1)
-        return Design(features, self.mask, self.label, self.known)
+        return Design(features, self.mask, self.label, self.known, self.extra)
 
     def log_likelihood(self, weights: Tensor) -> Tensor:
         """(B,) exact log p(true labels | observation) by the forward recursion (spec 6.5). weights: (U + P,)."""
         split = self.unary.shape[-1]
-        log_unary = (self.unary @ weights[:split]).masked_fill(~self.mask, -torch.inf)
+        log_unary = add_log(self.unary @ weights[:split], self.extra).masked_fill(~self.mask, -torch.inf)
         log_unary = torch.where(self.known[..., None], log_unary, torch.zeros_like(log_unary))
         both = self.known[:, 1:] & self.known[:, :-1]
         log_pairwise = (self.pairwise @ weights[split:]) * both[..., None, None]
@@ -148,7 +153,7 @@ def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters
     unary = association_unary(view, states, moved, scales, boosters)
     pairwise = pairwise_features(batch.source, batch.target, index, scales)
     known = truth.known & batch.source_mask
-    return Chain(unary, pairwise, state_mask(mask), label, known)
+    return Chain(unary, pairwise, state_mask(mask), label, known, association_extra(view.learned, index))
 
 
 def association_design(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> Design:
@@ -166,7 +171,8 @@ def clustering_chain(view: PairView, plugins: PlugIns, scales: Scales) -> Chain:
     pairwise = clustering.pairwise_features(batch.source, at, scales)
     label = torch.where(plugins.label >= 0, plugins.label, C)
     known = plugins.known & batch.source_mask
-    return Chain(local, pairwise, possible_clusters(plugins.active, plugins.reach, label.shape[1]), label, known)
+    possible = possible_clusters(plugins.active, plugins.reach, label.shape[1])
+    return Chain(local, pairwise, possible, label, known, clustering_extra(view.learned, C + 1))
 
 
 def clustering_design(view: PairView, plugins: PlugIns, scales: Scales) -> Design:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from torchcrf_scan.baselines.cascade import Cascade
-from torchcrf_scan.config import Config
+from torchcrf_scan.config import Config, EncoderConfig
 from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.learning.weights_fit import Watch
@@ -17,7 +17,8 @@ from torchcrf_scan.model import ClusteringCRF, MatchingCRF
 def fit_cascade(material: Sequence[Material], config: Config, watch: Mapping[str, dict[str, Watch]] | None = None) -> Cascade:
     """The fitted cascade. watch: callbacks of the weight fits, of `matching` and of `clustering`, see `fit`."""
     watch = watch or {}
-    matching, clustering = MatchingCRF(config.model), ClusteringCRF(config.model)
+    bare = replace(config.model, encoder=EncoderConfig())  # whose potentials are learned for both chains together
+    matching, clustering = MatchingCRF(bare), ClusteringCRF(bare)
     margins = fit(matching, material, config.learning, watch.get("matching"))
     fed = []
     for part in material:

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchcrf_scan.model import JointScanCRF
+
 log = logging.getLogger(__name__)
 
 NAME = "checkpoint.pt"
@@ -97,6 +99,20 @@ class Store:
             raise ValueError(f"resume: expected the settings of the run in {self.folder}, got {told}")
         self.last = state["step"]
         return dict(state)
+
+
+def load_weights(model: JointScanCRF, origin: str | JointScanCRF) -> None:
+    """Takes over the weights of a model, or of a saved one by its folder or name; parts that it has not stay as they are.
+
+    Raises:
+        ValueError: no such model, or one of other features.
+    """
+    saved = (origin if isinstance(origin, JointScanCRF) else JointScanCRF.from_pretrained(origin)).state_dict()
+    fresh = model.embedding_state | {name: value for name, value in model.state_dict().items() if name.startswith("encoder.")}
+    try:
+        model.load_state_dict(fresh | saved)
+    except RuntimeError as error:
+        raise ValueError(f"init: expected a model with the features of `model.features`, got {origin}: {error}") from error
 
 
 def random_state() -> dict[str, Any]:

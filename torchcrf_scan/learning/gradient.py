@@ -181,9 +181,9 @@ def train_by_gradient(
         parts = f"{gradient.batch_size} / {gradient.part}"
         raise ValueError(f"gradient.part: expected {parts} parts to be shared out among {ranks.world} processes, got a remainder")
     objective = make_objective(config)
-    needs_start = config.first_order == "unrolled"
+    needs_start, backend = config.first_order != "pseudo_likelihood", model.config.inference.backend
     learner = Learner(model, gradient, ranks)
-    validation = Validation.of(held_out, gradient.part, ranks)
+    validation = Validation.of(held_out, gradient.part, ranks, model.config.inference.backend)
 
     def look() -> None:
         if not held_out:
@@ -207,7 +207,7 @@ def train_by_gradient(
         learner.load_state_dict(state)
         set_random_state(state["random"])
     parts_left = Parts(gradient.batch_size, gradient.part, learner.step, gradient.steps, ranks.rank, ranks.world)
-    collate = Collate(config.learning.disturbance, gradient.seed, needs_start)
+    collate = Collate(config.learning.disturbance, gradient.seed, needs_start, backend)
     portions = load_portions(PairStream(gradient, pairs), parts_left, collate, gradient.workers)
     while learner.step < gradient.steps and not learner.stopping.is_over:
         report = learner.descend(objective, portions)

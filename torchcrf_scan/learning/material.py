@@ -9,13 +9,13 @@ import torch
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-from torchcrf_scan.backend import can_search
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import LearningConfig
-from torchcrf_scan.inference.initialise import Start, Survey, choose, survey
+from torchcrf_scan.inference.initialise import Start, Survey, choose
 from torchcrf_scan.inference.movers import HypothesisScore
 from torchcrf_scan.learning.disturb import disturb
 from torchcrf_scan.learning.hypothesis_fit import HypothesisView, fit_hypothesis_score, view_pair
+from torchcrf_scan.learning.portions import look
 from torchcrf_scan.scan import ScanPair
 
 PART = 4  # pairs that one job looks at
@@ -111,11 +111,7 @@ def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1, ba
 def _look(
     batch: ScanPairBatch, pairs: Sequence[ScanPair], seeds: Sequence[int], backend: str
 ) -> tuple[list[Survey | None], list[list[HypothesisView]]]:
-    if can_search(backend, batch.source):
-        from torchcrf_scan.compiled.pair import survey as look
-    else:
-        look = survey
-    return look(batch), [view_pair(pair, seed) for pair, seed in zip(pairs, seeds, strict=True)]
+    return look(batch, backend), [view_pair(pair, seed) for pair, seed in zip(pairs, seeds, strict=True)]
 
 
 def assign_folds(sequences: Sequence[str], folds: int) -> list[int]:

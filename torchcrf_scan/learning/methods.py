@@ -7,6 +7,8 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -19,26 +21,31 @@ from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
 from torchcrf_scan.baselines.ransac import match_ransac
 from torchcrf_scan.baselines.start import label_nearest
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import Config, LearningConfig, ModelConfig
+from torchcrf_scan.config import Config, EncoderConfig, LearningConfig, ModelConfig
 from torchcrf_scan.features.scales import LOCAL_CHANNELS
 from torchcrf_scan.inference.initialise import Start, nearest_association
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.cascade_fit import fit_cascade
+from torchcrf_scan.learning.checkpoint import Store, load_weights
 from torchcrf_scan.learning.fit import Margins, fit
-from torchcrf_scan.learning.material import Collection, collect
+from torchcrf_scan.learning.gradient import train_by_gradient
+from torchcrf_scan.learning.material import Collection, Material, collect
 from torchcrf_scan.learning.plugins import reach_of_truth
+from torchcrf_scan.learning.ranks import ALONE
+from torchcrf_scan.learning.selection_fit import fit_potential
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import Floats, PairPrediction, ScanPair
 
 JOINT, EXACT = "joint", "joint, exact likelihood"
 LATTICE, LATTICE_EXACT = "joint, lattice", "joint, lattice, exact likelihood"
+ENCODED = "joint, encoder"
 HELD_ROUNDS = 10  # of the model whose motions are given
 METHODS = (
     *("all background", "ICP", "ICP, tuned", *LIBRARIES, "trimmed ICP + RANSAC"),
     *("K-Means (ICP)", "K-Means (ICP), ego removed", "CRF-Matching"),
     *("K-Means (CRF-Matching)", "K-Means (CRF-Matching), ego removed", "CRF-Clustering", "start + gated NN"),
-    *(JOINT, EXACT, LATTICE, LATTICE_EXACT, "joint, true motions", "joint, true associations"),
+    *(JOINT, ENCODED, EXACT, LATTICE, LATTICE_EXACT, "joint, true motions", "joint, true associations"),
 )  # rows of every table, in this order
 
 _fitted_features: dict[str, tuple[JointScanCRF, Margins]] = {}  # of this process, by `features_key`
@@ -93,15 +100,18 @@ def fit_models(study: Study, train: Sequence[int], config: Config, variants: boo
     """
     score = study.collection.fit_score(train)
     material = study.collection.material(train, score, config.model.inference.clusters - 1, config.learning)
-    joint = JointScanCRF(config.model)
+    joint = JointScanCRF(replace(config.model, encoder=EncoderConfig()))
     joint.hypothesis_score = score
     key = features_key(study, train, config)
     margins = fit(joint, material, config.learning, features_of=_fitted_features.get(key))
     models = {JOINT: joint}
+    if config.model.encoder.width > 0:
+        models[ENCODED] = fit_encoded(joint, [study.pairs[k] for k in train], material, config)
     if config.experiment.joint_alone:
         _fitted_features.setdefault(key, (joint, margins))
         return Models(models)
-    for name, variant, learning in joint_variants(config) if variants else []:
+    bare = replace(config, model=joint.config)
+    for name, variant, learning in joint_variants(bare) if variants else []:
         models[name] = JointScanCRF(variant)
         models[name].hypothesis_score = score
         fit(models[name], material, learning, features_of=(joint, margins))
@@ -109,6 +119,22 @@ def fit_models(study: Study, train: Sequence[int], config: Config, variants: boo
         calibrate(model, material)
     cascade = fit_cascade(material, config)
     return Models(models, cascade, choose_gate(study.icp_shares[list(train)], GATES))
+
+
+def fit_encoded(joint: JointScanCRF, pairs: Sequence[ScanPair], material: Sequence[Material], config: Config) -> JointScanCRF:
+    """A model with an encoder, trained first order on the pairs and fresh ones, from `config.init` or a fitted joint model on.
+
+    Raises:
+        ValueError: the config names no objective for it.
+    """
+    if config.first_order == "none":
+        raise ValueError("gradient.objective: expected one for a model with an encoder, got none")
+    model = JointScanCRF(config.model)
+    load_weights(model, config.init or joint)
+    with TemporaryDirectory() as folder:
+        train_by_gradient(model, config, pairs, (), Store(Path(folder), {}), ALONE)
+    model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
+    return model
 
 
 def features_key(study: Study, train: Sequence[int], config: Config) -> str:

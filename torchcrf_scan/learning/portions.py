@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader
 
+from torchcrf_scan.backend import can_search
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.stream import PairStream, Parts, Sample, seed_of
 from torchcrf_scan.inference.initialise import Survey, survey
@@ -21,10 +22,15 @@ from torchcrf_scan.scan import ScanPair
 
 @dataclass(frozen=True, slots=True)
 class Portion:
-    """A batch to learn from; `surveys`: what InitialiseRT looks at in its pairs, none where nobody needs it."""
+    """A batch to learn from.
+
+    Attributes:
+        surveys: what InitialiseRT looks at in its pairs, none where nobody needs it. seed: of what is drawn beside it.
+    """
 
     batch: ScanPairBatch
     surveys: tuple[Survey | None, ...] = ()
+    seed: int = 0
 
     def to(self, device: torch.device) -> Portion:
         """The batch on another device. Surveys stay, they are looked at where they were made."""
@@ -36,12 +42,14 @@ class Collate:
     """Makes a batch of samples, in the worker: frames displaced, scans disturbed, surveyed where the loss needs a start.
 
     Attributes:
-        disturbance: see `learning.disturbance`. seed: of the disturbance. surveys: whether to look for motions.
+        disturbance: see `learning.disturbance`. seed: of all that is drawn. surveys: whether to look for motions, and what
+            `backend` does.
     """
 
     disturbance: float = 0.0
     seed: int = 0
     surveys: bool = False
+    backend: str = "auto"
 
     def __call__(self, samples: Sequence[Sample]) -> Portion:
         """The portion of the samples, of which the first one's index decides how they are disturbed."""
@@ -51,7 +59,17 @@ class Collate:
         if self.disturbance > 0:
             generator = torch.Generator().manual_seed(seed_of(self.seed, samples[0].index, 2))
             batch = disturb(batch, self.disturbance, generator)
-        return Portion(batch, tuple(survey(batch)) if self.surveys else ())
+        surveys = tuple(look(batch, self.backend)) if self.surveys else ()
+        return Portion(batch, surveys, seed_of(self.seed, samples[0].index, 3))
+
+
+def look(batch: ScanPairBatch, backend: str = "auto") -> list[Survey | None]:
+    """What InitialiseRT looks at in every pair. backend: what searches for motions, see `InferenceConfig`."""
+    if can_search(backend, batch.source):
+        from torchcrf_scan.compiled import pair
+
+        return pair.survey(batch)
+    return survey(batch)
 
 
 def load_portions(stream: PairStream, parts: Parts, collate: Collate, workers: int) -> Iterator[Portion]:
@@ -85,7 +103,7 @@ def leave_with(parent: int) -> None:
     os._exit(1)
 
 
-def as_portion(pairs: Sequence[ScanPair]) -> Portion:
+def as_portion(pairs: Sequence[ScanPair], backend: str = "auto") -> Portion:
     """Pairs as they are, surveyed."""
     batch = ScanPairBatch.collate(pairs)
-    return replace(Portion(batch), surveys=tuple(survey(batch)))
+    return Portion(batch, tuple(look(batch, backend)))

@@ -41,7 +41,7 @@ def fit_potential(model: JointScanCRF, material: Sequence[Material]) -> ClusterP
 
 def judge_clusters(model: JointScanCRF, part: Material) -> tuple[Tensor, Tensor]:
     """The potential's terms (P, 2) of all movers considered in a batch, and (P,) 1 where the cluster is a true mover's."""
-    view = model.view(part.batch)
+    view = model.view(part.batch, model.learned_inputs(part.batch, part.start))
     start = part.start.scaled(view.factor).considered()
     parameters, config = model.fitted, model.config.inference
     state = joint.first_state(view, start, parameters, config)

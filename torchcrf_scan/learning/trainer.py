@@ -29,11 +29,12 @@ from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.cascade_fit import fit_cascade
-from torchcrf_scan.learning.checkpoint import Store, write_bytes
+from torchcrf_scan.learning.checkpoint import Store, load_weights, write_bytes
 from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.learning.ranks import ALONE, Ranks, join
+from torchcrf_scan.learning.selection_fit import fit_potential
 from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import PairPrediction, ScanPair
@@ -88,6 +89,8 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
                 train_by_gradient(model, config, train_pairs, held_out, store, ranks, monitor, state=state)
         cascade = None
         if run is not None:
+            if config.first_order != "none" and model.config.chains == "joint":
+                model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
             calibrate(model, material)
             cascade = fit_baselines(material, config, run)
             model.save_pretrained(folder / "model")
@@ -140,19 +143,6 @@ def prepare(
     if state is None and not config.init:
         fit(model, material, config.staged, watches(run, "joint"))
     return material
-
-
-def load_weights(model: JointScanCRF, name_or_path: str) -> None:
-    """Takes over the weights of a saved model.
-
-    Raises:
-        ValueError: no such model, or one of other features.
-    """
-    saved = JointScanCRF.from_pretrained(name_or_path).state_dict()
-    try:
-        model.load_state_dict(saved)
-    except RuntimeError as error:
-        raise ValueError(f"init: expected a model with the features of `model.features`, got {name_or_path}: {error}") from error
 
 
 def settings_of(config: Config) -> dict[str, str]:

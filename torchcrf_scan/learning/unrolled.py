@@ -87,7 +87,7 @@ def unrolled_sums(
     if batch.truth is None:
         raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
     start = start or model.initialise(batch)
-    view = model.view(batch, model.learned_inputs(batch, **layer_inputs))
+    view = model.view(batch, model.learned_inputs(batch, start, **layer_inputs))
     rounds = joint.rounds(view, start.scaled(view.factor), model.fitted, unrolled_settings(model.config, config))
     weights = round_weights(config)
     states = [joint.merge_alike(view, done.state, model.scales.cluster_distance) for done in rounds[-len(weights) :]]

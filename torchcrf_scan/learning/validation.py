@@ -46,10 +46,10 @@ class Validation:
     portions: tuple[Portion, ...]
 
     @classmethod
-    def of(cls, pairs: Sequence[ScanPair], part: int, ranks: Ranks) -> Validation:
+    def of(cls, pairs: Sequence[ScanPair], part: int, ranks: Ranks, backend: str = "auto") -> Validation:
         """Looks at this process's parts of the pairs, `part` pairs each."""
         parts = [tuple(range(k, min(k + part, len(pairs)))) for k in range(0, len(pairs), part)][ranks.rank :: ranks.world]
-        return cls(tuple(pairs), tuple(parts), tuple(as_portion([pairs[k] for k in places]) for places in parts))
+        return cls(tuple(pairs), tuple(parts), tuple(as_portion([pairs[k] for k in places], backend) for places in parts))
 
     @torch.no_grad()
     def losses(self, model: JointScanCRF, objective: Objective, ranks: Ranks) -> dict[str, float]:

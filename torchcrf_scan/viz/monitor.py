@@ -188,7 +188,7 @@ def belief_changes(model: JointScanCRF, batch: ScanPairBatch, start: Start) -> d
     """
     if model.config.inference.schedule != "sweep":
         return {}
-    view = model.view(batch)
+    view = model.view(batch, model.learned_inputs(batch, start))
     found = joint.rounds(view, start.scaled(view.factor), model.fitted, model.config)
     beliefs = [of.state.log_cluster.exp() for of in found]
     if beliefs[0].shape != beliefs[-1].shape:  # CRF-Matching has other states than its start

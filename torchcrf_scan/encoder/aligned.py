@@ -1,0 +1,172 @@
+"""What the encoder sees of a point: its surroundings in its own scan, and the other scan where the present motions carry it.
+
+Everything is free of scale: lengths are measured in what a beam covers at the point's range, and noise; angles in beam steps. All
+of it is looked up along the beams, so the cost is linear in the points (design finding 15).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcrf_scan.backend import can_search
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.features.free_space import Sweep, bearing_in, look, rising_turn
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference.initialise import Start
+
+BESIDE = (-2, -1, 1, 2)  # points of its own scan that a point is compared with
+WINDOW = 6  # beams of the other scan to each side, among which the nearest point is looked for
+PROFILE = 3  # of them that are shown to the encoder one by one
+FARTHEST = 20.0  # units; farther is all the same
+LARGEST_TURN = 5.0  # beam steps, likewise
+NOWHERE = 2.5  # stands for a difference of ranges where there is no other point
+NEAR = 3.0  # units within which a mover counts where nobody knows its reach
+LONGEST_CHORD = 4.0  # units; neighbouring points farther apart are no surface between them
+CHANNELS = (
+    *(f"range of the point {k:+d} beside" for k in BESIDE),
+    *("turn to the point before", "turn to the point after", "footprint over noise", "range over the usual range"),
+    *(f"range of the other scan's beam {k:+d}" for k in range(-PROFILE, PROFILE)),
+    *("turn from the beam before", "turn to the beam after", "distance to its nearest point", "distance to its surface"),
+    *("seen through", "hidden", "distance under the best mover", "probability of that mover", "gain of the best mover", "is there"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """One scan and the motions that carry it into the other's frame.
+
+    Attributes:
+        points: (B, P, 2), mask: (B, P), sweep: of the scan. other, other_sweep: (B, Q, 2) points and sweep of the other scan.
+        motions: (B, C, 3). log_odds: (B, C) of there being such a mover. reach: (B, P, C); None: within `NEAR` units of it.
+    """
+
+    points: Tensor
+    mask: Tensor
+    sweep: Sweep
+    other: Tensor
+    other_sweep: Sweep
+    motions: Tensor
+    log_odds: Tensor
+    reach: Tensor | None
+
+
+@torch.no_grad()
+def aligned_inputs(batch: ScanPairBatch, start: Start, backend: str = "auto", *, both: bool = True) -> tuple[Tensor, ...]:
+    """(B, N, F) the `CHANNELS` of the source points, and with `both` (B, M, F) of the target points; 0 in the padding.
+
+    start: as `initialise` gives it. backend: see `InferenceConfig`.
+    """
+    if can_search(backend, batch.source):
+        from torchcrf_scan.compiled import pair
+
+        return pair.aligned_inputs(batch, start, both=both)
+    here = torch.zeros_like(batch.target_origin)
+    source = Sweep.of(batch.source, batch.source_mask, batch.source_closed, batch.range_noise, here)
+    target = Sweep.of(batch.target, batch.target_mask, batch.target_closed, batch.range_noise, batch.target_origin)
+    is_there = torch.where(start.active, torch.inf, -torch.inf).to(start.motions)
+    log_odds = is_there if start.log_odds is None else start.log_odds
+    motions, back = start.motions, se2.inverse(start.motions)
+    sides = [Side(batch.source, batch.source_mask, source, batch.target, target, motions, log_odds, start.reach)]
+    if both:
+        sides.append(Side(batch.target, batch.target_mask, target, batch.source, source, back, log_odds, None))
+    return tuple(channels_of(side) for side in sides)
+
+
+def channels_of(side: Side) -> Tensor:
+    """(B, P, F) the channels of one scan's points."""
+    own, unit = own_channels(side)
+    moved = se2.apply(side.motions, side.points[:, None])  # (B, C, P, 2)
+    across, distance = cross_channels(side, moved, unit)
+    sight = look(side.other_sweep, moved[:, 0])
+    best, sure = best_mover(side, distance)
+    background = distance[:, 0]
+    rest = [sight.seen_through, sight.hidden, torch.log1p(best), sure, torch.log1p(background) - torch.log1p(best)]
+    channels = torch.cat([own, across, torch.stack([*rest, torch.ones_like(best)], -1)], -1)
+    return torch.where(side.mask[..., None], channels, 0.0)
+
+
+def own_channels(side: Side) -> tuple[Tensor, Tensor]:
+    """(B, P, 8) what a scan says of its own points, and (B, P) the unit of length at each."""
+    sweep = side.sweep
+    ranges = torch.where(side.mask, sweep.ranges, 0.0)
+    bearings = torch.where(side.mask, sweep.bearings, 0.0)
+    footprint = sweep.noise[:, None] + ranges * sweep.step[:, None]
+    unit = footprint.clamp(min=1e-9)
+    place = torch.arange(ranges.shape[1], device=ranges.device).expand_as(side.mask)
+    found = []
+    for k in BESIDE:
+        beside, there = along_scan(sweep, place + k)
+        found.append(torch.where(there, squash((ranges.gather(1, beside) - ranges) / unit), NOWHERE))
+    for k in (-1, 1):
+        beside, there = along_scan(sweep, place + k)
+        turn = rising_turn(k * (bearings.gather(1, beside) - bearings)) / sweep.step[:, None]
+        found.append(torch.log1p(torch.where(there, (turn - 1).clamp(0, LARGEST_TURN), LARGEST_TURN)))
+    found.append(torch.log(unit / sweep.noise[:, None].clamp(min=1e-9)).clamp(max=8.0) / 2 - 1)
+    usual = torch.where(side.mask, ranges, torch.nan).nanmedian(1, keepdim=True).values.nan_to_num(nan=1.0)
+    found.append(torch.log(ranges.clamp(min=1e-9) / usual.clamp(min=1e-9)).clamp(-3.0, 3.0))
+    return torch.stack(found, -1), unit
+
+
+def cross_channels(side: Side, moved: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, P, 10) what the other scan says of points under the background's motion, and (B, C, P) units to its nearest point.
+
+    moved: (B, C, P, 2) points under every motion. unit: (B, P).
+    """
+    B, C, P = moved.shape[:3]
+    sweep = side.other_sweep
+    bearing = bearing_in(sweep, moved.flatten(1, 2) - sweep.origin[:, None])  # (B, C P)
+    after = torch.searchsorted(sweep.bearings, bearing.contiguous())
+    beam, there = along_scan(sweep, after[..., None] + torch.arange(-WINDOW, WINDOW, device=after.device))  # (B, C P, 2 W)
+    beam, there = beam.view(B, C, P, -1), there.view(B, C, P, -1)
+    arms = side.other.gather(1, beam.view(B, -1, 1).expand(-1, -1, 2)).view(B, C, P, -1, 2) - moved[..., None, :]
+    distance = torch.linalg.vector_norm(arms, dim=-1) / unit[:, None, :, None]
+    nearest = distance.masked_fill(~there, FARTHEST).clamp(max=FARTHEST).amin(-1)
+
+    arms, beam, there, bearing = arms[:, 0], beam[:, 0], there[:, 0], bearing.view(B, C, P)[:, 0]
+    chord = arms[..., 1:, :] - arms[..., :-1, :]
+    share = (-(arms[..., :-1, :] * chord).sum(-1) / (chord**2).sum(-1).clamp(min=1e-12)).clamp(0, 1)
+    gap = torch.linalg.vector_norm(arms[..., :-1, :] + share[..., None] * chord, dim=-1) / unit[..., None]
+    is_surface = there[..., 1:] & there[..., :-1] & (torch.linalg.vector_norm(chord, dim=-1) < LONGEST_CHORD * unit[..., None])
+    surface = torch.minimum(gap.masked_fill(~is_surface, FARTHEST).amin(-1), nearest[:, 0])
+
+    middle = slice(WINDOW - PROFILE, WINDOW + PROFILE)
+    ranges = sweep.ranges.gather(1, beam[..., middle].flatten(1)).view(B, P, -1)
+    own = torch.linalg.vector_norm(moved[:, 0] - sweep.origin[:, None], dim=-1, keepdim=True)
+    profile = torch.where(there[..., middle], squash((ranges - own) / unit[..., None]), NOWHERE)
+    step = sweep.step[:, None]
+    bearings = sweep.bearings.gather(1, beam[..., WINDOW - 1 : WINDOW + 1].flatten(1)).view(B, P, 2)
+    turns = torch.stack([rising_turn(bearing - bearings[..., 0]), rising_turn(bearings[..., 1] - bearing)], -1) / step[..., None]
+    turns = torch.where(there[..., WINDOW - 1 : WINDOW + 1], turns, LARGEST_TURN).clamp(max=LARGEST_TURN)
+    return torch.cat([profile, torch.log1p(turns), torch.log1p(torch.stack([nearest[:, 0], surface], -1))], -1), nearest
+
+
+def best_mover(side: Side, distance: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, P) units to the other scan under the best mover, and how probable the most probable mover is that comes near.
+
+    distance: (B, C, P) units under every motion.
+    """
+    distance = distance[:, 1:]
+    reach = distance < NEAR if side.reach is None else side.reach[..., 1:].mT
+    there = reach & (side.log_odds[:, 1:, None] > -torch.inf)
+    sure = torch.sigmoid(side.log_odds[:, 1:, None]) * torch.exp(-distance / 2) * there
+    none = distance.new_zeros(distance.shape[0], 1, distance.shape[2])
+    distance = torch.cat([distance.masked_fill(~there, FARTHEST), none + FARTHEST], 1)
+    return distance.amin(1), torch.cat([sure, none], 1).amax(1)
+
+
+def along_scan(sweep: Sweep, place: Tensor) -> tuple[Tensor, Tensor]:
+    """Real points at places (B, ...) along a scan, round a closed one, and where there are such."""
+    extra = (1,) * (place.dim() - 1)
+    count = sweep.count.view(-1, *extra)
+    closed = sweep.closed.view(-1, *extra) & (count > 0)
+    there = ((place >= 0) & (place < count)) | closed
+    last = (count - 1).clamp(min=0)
+    return torch.where(closed, place % (last + 1), torch.minimum(place.clamp(min=0), last)), there
+
+
+def squash(values: Tensor) -> Tensor:
+    """Small values as they are but for a factor, large ones by their logarithm, signed."""
+    return torch.asinh(values) / 2

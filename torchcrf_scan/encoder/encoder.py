@@ -1,0 +1,93 @@
+"""The network: residual convolutions of growing reach along the beams, round a closed scan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.config import EncoderConfig
+from torchcrf_scan.encoder.aligned import CHANNELS, aligned_inputs
+from torchcrf_scan.features.learned import ExtraLogUnary
+from torchcrf_scan.inference.initialise import Start
+
+
+@dataclass(frozen=True, slots=True)
+class Encoded:
+    """What the encoder says of B pairs.
+
+    Attributes:
+        extra: log potentials of the source points.
+        source_embedding: (B, N, E), target_embedding: (B, M, E); None: it makes none.
+    """
+
+    extra: ExtraLogUnary
+    source_embedding: Tensor | None = None
+    target_embedding: Tensor | None = None
+
+
+class ScanEncoder(nn.Module):
+    """Log potentials and embeddings of points from `aligned_inputs`; before it has learned anything its potentials are 0.
+
+    Gradients reach its own weights; what it sees of scans and motions has none.
+    """
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__()
+        self.embedding = config.embedding
+        self.reach = sum(config.dilations)
+        self.first = nn.Linear(len(CHANNELS), config.width)
+        self.layers = nn.ModuleList(Layer(config.width, dilation) for dilation in config.dilations)
+        self.last = nn.Linear(config.width, 2 + config.embedding)
+        nn.init.zeros_(self.last.weight[:2])
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, batch: ScanPairBatch, start: Start, backend: str = "auto") -> Encoded:
+        """What it says of a batch under the motions of a start. backend: of `aligned_inputs`."""
+        source, *target = aligned_inputs(batch, start, backend, both=self.embedding > 0)
+        logits = self.encode(source.to(self.last.weight), batch.source_mask, batch.source_closed).to(source)
+        extra = ExtraLogUnary(outlier=logits[..., 0], moving=logits[..., 1])
+        if not target:
+            return Encoded(extra)
+        of_target = self.encode(target[0].to(self.last.weight), batch.target_mask, batch.target_closed).to(source)
+        return Encoded(extra, logits[..., 2:], of_target[..., 2:])
+
+    def encode(self, inputs: Tensor, mask: Tensor, closed: Tensor) -> Tensor:
+        """(B, P, 2 + E) outlier, moving, embedding of every point. inputs: (B, P, F); mask: (B, P); closed: (B,)."""
+        hidden = unroll(torch.relu(self.first(inputs)), mask, closed, self.reach)
+        for layer in self.layers:
+            hidden = layer(hidden)
+        return self.last(hidden)
+
+
+class Layer(nn.Module):
+    """A depthwise convolution of three points, then a mixture of the channels, beside what came in; ends get shorter."""
+
+    def __init__(self, width: int, dilation: int) -> None:
+        super().__init__()
+        self.dilation = dilation
+        self.norm = nn.LayerNorm(width)
+        self.taps = nn.Parameter(torch.randn(3, width) / 3**0.5)
+        self.mix = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))
+
+    def forward(self, hidden: Tensor) -> Tensor:
+        """(B, P, width) -> (B, P - 2 dilation, width)."""
+        d, inner = self.dilation, hidden.shape[1] - 2 * self.dilation
+        seen = self.norm(hidden)
+        before, here, after = self.taps
+        seen = seen[:, :inner] * before + seen[:, d : d + inner] * here + seen[:, 2 * d :] * after
+        return hidden[:, d : d + inner] + self.mix(seen)
+
+
+def unroll(values: Tensor, mask: Tensor, closed: Tensor, reach: int) -> Tensor:
+    """(B, P + 2 reach, F) the real points with `reach` more at both ends: a closed scan goes on round, an open one in zeros.
+
+    values: (B, P, F). mask: (B, P). closed: (B,).
+    """
+    count = mask.sum(1, keepdim=True)
+    place = torch.arange(-reach, values.shape[1] + reach, device=values.device)[None]
+    there = ((place >= 0) & (place < count)) | (closed[:, None] & (count > 0))
+    index = torch.where(closed[:, None], place % count.clamp(min=1), place).clamp(0, values.shape[1] - 1)
+    return values.gather(1, index[..., None].expand(-1, -1, values.shape[2])) * there[..., None]
