@@ -1,5 +1,6 @@
 """Fixtures of all tests: fixed seeds, and the recordings that lie beside the repository but never in it."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,10 @@ import torch
 from hypothesis import HealthCheck, settings
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # one of as many processes as there are cores: it has one, and so have its programs
+    torch.set_num_threads(1)
+    os.environ |= {"OMP_NUM_THREADS": "1", "LOKY_MAX_CPU_COUNT": "1"}
 
 settings.register_profile(  # the same examples in every run, and no failure because the machine is busy
     "repository", derandomize=True, max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow]

@@ -1,6 +1,6 @@
-"""A first-order run of seconds, for tests that kill it or share it out; also a program of its own:
+"""A first-order run of seconds, for tests that kill it or share it out; also a program of its own, which writes its losses:
 
-python small_run.py FOLDER [--resume] [--kill-after STEP] [--kill-in-write STEP] [--GRADIENT_SETTING VALUE ...]
+python small_run.py FOLDER [--kill-after STEP] [--kill-in-write STEP] [--GRADIENT_SETTING VALUE ...]
 """
 
 import argparse
@@ -98,7 +98,6 @@ def kill_in_write(step: int) -> None:
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--resume", action="store_true")
     parser.add_argument("--kill-after", type=int)
     parser.add_argument("--kill-in-write", type=int)
     known, rest = parser.parse_known_args(arguments)
@@ -108,9 +107,8 @@ def main(arguments: list[str]) -> None:
     if known.kill_in_write is not None:
         kill_in_write(known.kill_in_write)
     with join("cpu") as ranks:
-        learner, watcher = run(known.folder, small_config(**changes), ranks, resume=known.resume, kill_after=known.kill_after)
+        _, watcher = run(known.folder, small_config(**changes), ranks, kill_after=known.kill_after)
         if ranks.is_first:
-            torch.save({"last": learner.state_dict(), "model": learner.model.state_dict()}, known.folder / "final.pt")
             curve = {"loss": [report.terms["total"] for report in watcher.reports], "validation": watcher.validations}
             (known.folder / "curve.json").write_text(json.dumps(curve))
 

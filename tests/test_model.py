@@ -430,7 +430,7 @@ def test_gradients_of_padded_simulated_pairs_are_finite(pairs: list[ScanPair]) -
 
 @pytest.mark.parametrize("metric", ["point", "line"])
 def test_gradcheck_of_the_unrolled_rounds_in_the_weights(metric: str) -> None:
-    batch, start = tiny(8)
+    batch, start = tiny(6)
     model = soft_model(metric)
     names = [name for name, _ in model.named_parameters()]
 

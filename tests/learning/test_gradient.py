@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import small_run
 import torch
+from small_run import Watcher
 from torch import Tensor
 
 from torchcrf_scan.learning.checkpoint import NAME
@@ -52,41 +53,40 @@ def assert_identical(a: Any, b: Any, where: str = "") -> None:
         assert a == b, where
 
 
+def final(learner: Learner) -> dict[str, Any]:
+    """All that a run ends with: the state that goes on and the weights that are kept."""
+    return {"last": learner.state_dict(), "model": dict(learner.model.state_dict())}
+
+
 @pytest.fixture(scope="module")
-def straight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Learner, Watcher]:
     """A run that nobody disturbed."""
-    folder = tmp_path_factory.mktemp("straight")
-    assert start(str(folder)) == 0
-    return folder
-
-
-def final(folder: Path) -> dict[str, Any]:
-    return torch.load(folder / "final.pt", weights_only=True)
+    return small_run.run(tmp_path_factory.mktemp("straight"), small_run.small_config())
 
 
 @pytest.mark.parametrize(
-    ("death", "reached"),
-    [(("--kill-after", "5"), 4), (("--kill-in-write", "4"), 2), (("--kill-after", "1", "--workers", "1"), 0)],
+    ("death", "workers", "reached"),
+    [(("--kill-after", "5"), 0, 4), (("--kill-in-write", "4"), 0, 2), (("--kill-after", "1", "--workers", "1"), 1, 0)],
 )
-def test_killed_and_resumed_ends_bit_for_bit_the_same(death: tuple[str, ...], reached: int, straight: Path, tmp_path: Path) -> None:
-    """reached: step of the last checkpoint before the end."""
+def test_killed_and_resumed_ends_bit_for_bit_the_same(
+    death: tuple[str, ...], workers: int, reached: int, straight: tuple[Learner, Watcher], tmp_path: Path
+) -> None:
+    """reached: step of the last checkpoint before the end. What a process of its own began, this one ends."""
     assert start(str(tmp_path), *death) == KILLED
-    assert not (tmp_path / "final.pt").exists()
-    assert start(str(tmp_path), "--resume") == 0
-    assert_identical(final(tmp_path), final(straight))
-    curves = [json.loads((folder / "curve.json").read_text()) for folder in (straight, tmp_path)]
-    rest = len(curves[1]["loss"])
-    assert rest == 6 - reached
-    assert curves[1]["loss"] == curves[0]["loss"][-rest:]
+    assert not (tmp_path / "curve.json").exists()
+    learner, watcher = small_run.run(tmp_path, small_run.small_config(workers=workers), resume=True)
+    assert_identical(final(learner), final(straight[0]))
+    assert len(watcher.reports) == 6 - reached
+    assert [report.terms for report in watcher.reports] == [report.terms for report in straight[1].reports[reached:]]
 
 
-def test_two_processes_have_the_loss_curve_of_one(straight: Path, tmp_path: Path) -> None:
+def test_two_processes_have_the_loss_curve_of_one(straight: tuple[Learner, Watcher], tmp_path: Path) -> None:
     launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
     assert start(str(tmp_path), launcher=launcher) == 0
-    one, two = (json.loads((folder / "curve.json").read_text()) for folder in (straight, tmp_path))
-    assert two["loss"] == pytest.approx(one["loss"], rel=1e-5)
+    two, one = json.loads((tmp_path / "curve.json").read_text()), straight[1]
+    assert two["loss"] == pytest.approx([report.terms["total"] for report in one.reports], rel=1e-5)
     assert [step for step, _ in two["validation"]] == [0, 2, 4, 6]
-    assert [loss for _, loss in two["validation"]] == pytest.approx([loss for _, loss in one["validation"]], rel=1e-5)
+    assert [loss for _, loss in two["validation"]] == pytest.approx([loss for _, loss in one.validations], rel=1e-5)
 
 
 @pytest.mark.parametrize("objective", ["pseudo_likelihood", "unrolled"])
@@ -122,7 +122,7 @@ def test_without_validation_the_last_weights_are_kept(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_fills_up_does_not_stop_the_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, straight: Path
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, straight: tuple[Learner, Watcher]
 ) -> None:
     calls = 0
 
@@ -137,7 +137,7 @@ def test_a_disk_that_fills_up_does_not_stop_the_training(
         learner, _ = small_run.run(tmp_path, small_run.small_config())
     assert "checkpoint of step 6 not written" in caplog.text
     assert "that of step 0 is kept" in caplog.text
-    assert_identical(dict(learner.model.state_dict()), dict(final(straight)["model"]))
+    assert_identical(dict(learner.model.state_dict()), dict(straight[0].model.state_dict()))
     assert torch.load(tmp_path / NAME, weights_only=True)["step"] == 0
 
 
