@@ -24,6 +24,8 @@ def test_the_python_blocks_run_one_after_the_other():
     assert abs(x + 0.3) < 0.05
     assert abs(y) < 0.05
     assert namespace["loss"].isfinite()
+    first, *_, last = namespace["losses"]
+    assert last < 0.9 * first  # the toy network has learned something
 
 
 def test_the_commands_run_one_after_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -214,21 +214,27 @@ def _collate_truth(pairs: Sequence[ScanPair], source_mask: Tensor, dtype: torch.
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """What the model says of a batch; tensors of points, batch first.
+    """What the model says of a batch; tensors of points, batch first. The README tells what every output's gradient is and costs.
+
+    Whole numbers and booleans have no gradient, and nothing has where compiled code answered or by the `flooding` schedule.
 
     Attributes:
-        association: (B, N) int64 target point, -1 outlier. Piecewise constant: no gradient.
-        cluster: (B, N) int64 0 background, 1..D-2 movers, -1 outlier. No gradient.
-        motions: (B, D-1, 3) `T_target_source` of background and movers.
-        active: (B, D-1) bool, the clusters that exist.
+        association: (B, N) int64 target point, -1 outlier.
+        cluster: (B, N) int64 0 background, 1..D-2 movers, -1 outlier.
+        motions: (B, D-1, 3) `T_target_source` of background and movers. Gradients reach what was learned only if
+            `motion_weights` is soft; with hard ones they reach the points alone and, point-to-line, the start's motions.
+        active: (B, D-1) bool, the clusters that exist. The others' motions are those of the start or of their last points.
         candidates: (B, N, K) int64 target point that every inlier association state stands for.
-        log_association: (B, N, K+1) normalised log-beliefs of the association chain, last = outlier.
-        log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier.
+        log_association: (B, N, K+1) normalised log-beliefs of the association chain, last = outlier; uniform in the padding.
+            Differentiable at the candidates that there are; kinks where labellings tie, but only at temperature 0.
+        log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier; likewise.
         converged: (B,) bool, whether labels and motions had settled.
         iterations: (B,) int64 rounds done.
         association_confidence: (B, N) in [0, 1], to be right within two target points; calibrated. None: the beliefs themselves.
-        cluster_confidence: (B, N) in [0, 1], calibrated. None: the beliefs themselves.
-        uncertainty: covariances of the motions and what of them was not observed; None for methods that do not say.
+            Gradient of the beliefs, at the label as it is.
+        cluster_confidence: (B, N) in [0, 1], calibrated. None: the beliefs themselves. Gradient likewise.
+        uncertainty: covariances of the motions and what of them was not observed; None for methods that do not say. Of these only
+            the covariances have a gradient.
     """
 
     association: Tensor

@@ -542,9 +542,9 @@ class Config:
     init: str = ""
 
     def __post_init__(self) -> None:
-        if self.learning.objective == "unrolled" and self.gradient.objective not in ("none", "unrolled"):
-            got = self.gradient.objective
-            raise ValueError(f"gradient.objective: expected unrolled with learning.objective unrolled, got {got}")
+        other = self.gradient.objective
+        if self.learning.objective == "unrolled" and other not in ("none", "unrolled"):
+            raise ValueError(f"gradient.objective: expected unrolled with learning.objective unrolled, got {other}")
         if self.init and self.first_order == "none":
             raise ValueError(f"init: expected a gradient.objective to go on with from {self.init}, got none")
 

@@ -164,6 +164,11 @@ class JointScanCRF(nn.Module):
         clusters = self.config.inference.clusters - 1
         if self.config.chains == "matching":
             clusters = 1
+        with torch.autocast(batch.source.device.type, enabled=False):  # a few centimetres decide which movers there are
+            return self._search(batch, clusters)
+
+    def _search(self, batch: ScanPairBatch, clusters: int) -> Start:
+        """The start of `initialise` with that many motions, in full precision."""
         if can_search(self.config.inference.backend, batch.source):
             from torchcrf_scan.compiled import movers, pair
 

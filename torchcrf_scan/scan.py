@@ -153,7 +153,7 @@ class ScanPair:
 
 @dataclass(frozen=True, slots=True)
 class PairPrediction:
-    """The answer for one pair, by source beam: exactly the contents of a prediction file.
+    """The answer for one pair, by source beam: exactly the contents of a prediction file. Arrays, without gradient.
 
     Attributes:
         association: (n,) int64 target beam, -1 outlier.

@@ -106,7 +106,7 @@ def test_help_tells_of_every_setting(capsys: pytest.CaptureFixture[str]) -> None
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("objective", "hinge", "expected one of none, pseudo_likelihood, unrolled, got hinge"),
+        ("objective", "hinge", "expected one of none, pseudo_likelihood, likelihood, unrolled, got hinge"),
         ("device", "tpu", "expected one of auto, cpu, cuda, got tpu"),
         ("worlds", ("moon",), "expected one of .*, got moon"),
         ("worlds", (), "expected at least one"),

@@ -54,6 +54,16 @@ def test_moving_points_have_their_average_precision_in_the_legend() -> None:
     assert [text.get_text() for text in legend.get_texts()] == ["joint: average precision 1.00"]
 
 
+def test_the_area_below_the_curve_is_the_average_precision() -> None:
+    score, moving = np.array([0.9, 0.5, 0.5, 0.5, 0.1]), np.array([True, False, True, False, True])
+    (line,) = plot_precision_recall({"joint": (score, moving)}).axes[0].lines
+    assert line.get_drawstyle() == "steps-pre"  # a step holds the precision of the threshold at its right end
+    recall, precision = (np.asarray(values) for values in line.get_data())
+    assert recall[0] == 0
+    assert (np.diff(recall) * precision[1:]).sum() == pytest.approx(precision_recall(score, moving)[2])
+    assert plot_precision_recall({"nothing": (np.zeros(0), np.zeros(0, dtype=bool))}).axes[0].lines
+
+
 def test_confidences_are_drawn_by_point() -> None:
     (pair,) = simulate_pairs(SimulatorConfig(beams=31), 1, 1, 0)
     n = pair.source.n_beams

@@ -16,7 +16,7 @@ from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.portions import as_portion
 from torchcrf_scan.learning.ranks import ALONE
 from torchcrf_scan.learning.trainer import flatten, settings_of
-from torchcrf_scan.learning.validation import BASELINE
+from torchcrf_scan.learning.validation import BASELINE, RIVAL
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.viz.monitor import GROUPS, TrainingMonitor, belief_changes, boosted_margins, named_weights
 
@@ -66,7 +66,7 @@ def test_looks_tell_losses_and_figures_beside_the_baseline(events: EventAccumula
     assert steps(events, "validation/total") == [0, 2, 4]
     for group, name in (("accuracy", "cluster_accuracy"), ("motion", "ego_rotation_median"), ("calibration", "cluster_ece")):
         assert name in GROUPS[group]
-        for method in ("joint", BASELINE):
+        for method in ("joint", BASELINE, RIVAL):
             assert steps(events, f"{group}/{name}/{method}") == [0, 2, 4]
     constant = {event.value for event in events.Scalars(f"accuracy/association_accuracy/{BASELINE}")}
     assert len(constant) == 1  # it has nothing to learn
@@ -117,6 +117,31 @@ def test_a_run_that_goes_on_hides_what_it_does_again(tmp_path: Path) -> None:
                 monitor.writer.add_scalar("loss/total", value, step)
     events = read(tmp_path).Scalars("loss/total")
     assert [(event.step, event.value) for event in events] == [(1, 1.0), (2, 2.0), (3, 30.0), (4, 40.0)]
+
+
+def test_another_run_in_the_folder_hides_the_one_before(tmp_path: Path) -> None:
+    for values in ((1.0, 2.0, 3.0), (10.0, 20.0)):
+        with TrainingMonitor(tmp_path, small_run.small_config()) as monitor:
+            for step, value in enumerate(values, 1):
+                monitor.writer.add_scalar("loss/total", value, step)
+    assert [event.value for event in read(tmp_path).Scalars("loss/total")] == [10.0, 20.0]
+
+
+def test_a_full_disk_ends_the_watching_and_not_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = small_run.small_config(steps=2)
+    train, held_out = small_run.small_pairs()
+    store = Store(tmp_path, settings_of(config))
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with TrainingMonitor(tmp_path, config) as monitor:
+        monkeypatch.setattr(monitor.writer, "add_scalar", refuse)
+        learner = train_by_gradient(JointScanCRF(config.model), config, train, held_out, store, ALONE, monitor)
+    assert learner.step == 2
+    assert caplog.text.count("nothing more is written for TensorBoard") == 1
 
 
 # --- what is shown ------------------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams import plugin_data_pb2
 
 from torchcrf_scan.evaluation.report import Table
 from torchcrf_scan.viz.tensorboard import RunLog
@@ -44,3 +45,14 @@ def test_only_numbers_of_a_summary_are_scalars(tmp_path: Path) -> None:
     events = read(tmp_path)
     assert events.Tags()["scalars"] == ["test/cluster_accuracy/joint"]
     assert events.Scalars("test/cluster_accuracy/joint")[0].value == pytest.approx(83.0)
+
+
+def test_settings_of_a_staged_run_stand_beside_what_came_of_it(tmp_path: Path) -> None:
+    with RunLog(tmp_path) as log:
+        log.settings({"learning.prior": 10.0, "data.simulate_train": ("street",)}, {"cluster_accuracy": 83.0})
+    events = read(tmp_path)
+    data = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
+    settings = plugin_data_pb2.HParamsPluginData.FromString(data).session_start_info.hparams
+    assert settings["learning.prior"].number_value == 10.0
+    assert settings["data.simulate_train"].string_value == "('street',)"
+    assert events.Scalars("final/cluster_accuracy")[0].value == pytest.approx(83.0)

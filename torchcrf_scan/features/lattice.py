@@ -102,7 +102,8 @@ class LatticeFeatures:
         by_kind = weights[ELASTIC_WEIGHTS, None] * weights.new_tensor(ELASTIC_KINDS)  # (3 features, 3 kinds)
         log_association = (self.pairwise_association @ weights[ASSOCIATION_PAIRWISE])[..., None] + self.elastic @ by_kind
         log_cluster = self.pairwise_cluster @ weights[CLUSTER_PAIRWISE]
-        return LatticePotentials(log_unary.masked_fill(~self.mask, -torch.inf), log_association, log_cluster)
+        found = (log_unary.masked_fill(~self.mask, -torch.inf), log_association, log_cluster)
+        return LatticePotentials(*(value.to(self.static) for value in found))  # autocast ends here, as on two chains
 
 
 def lattice_features(

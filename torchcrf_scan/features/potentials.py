@@ -174,8 +174,9 @@ def association_potentials(
         unary: (B, N, K+1, 19). pairwise: (B, N-1, K+1, K+1, 4). mask: (B, N, K) real candidates. weights: (23,).
         extra: (B, N, K+1) learned log potentials to add; None: none.
     """
-    log_unary = add_log(unary @ weights[:ASSOCIATION_UNARY], extra).masked_fill(~state_mask(mask), -torch.inf)
-    return log_unary, pairwise @ weights[ASSOCIATION_UNARY:]
+    log_unary = (unary @ weights[:ASSOCIATION_UNARY]).to(unary)  # autocast would carry its precision on through the messages
+    log_unary = add_log(log_unary, extra).masked_fill(~state_mask(mask), -torch.inf)
+    return log_unary, (pairwise @ weights[ASSOCIATION_UNARY:]).to(pairwise)
 
 
 def clustering_unary(view: PairView, at: clustering.Correspondence, motions: Tensor, active: Tensor, scales: Scales) -> Tensor:
@@ -209,8 +210,9 @@ def clustering_potentials(
         local: (B, N, D, 12). pairwise: (B, N-1, D, D, 8). possible: (B, N, D) bool. weights: (20,).
         extra: (B, N, D) learned log potentials to add; None: none.
     """
-    log_unary = add_log(local @ weights[:CLUSTERING_UNARY], extra).masked_fill(~possible, -torch.inf)
-    return log_unary, pairwise @ weights[CLUSTERING_UNARY:]
+    log_unary = (local @ weights[:CLUSTERING_UNARY]).to(local)
+    log_unary = add_log(log_unary, extra).masked_fill(~possible, -torch.inf)
+    return log_unary, (pairwise @ weights[CLUSTERING_UNARY:]).to(pairwise)
 
 
 def find_candidates(view: PairView, motions: Tensor, active: Tensor, config: InferenceConfig) -> Candidates:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -13,8 +14,9 @@ from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import Config, LearningConfig
-from torchcrf_scan.inference import pseudo_likelihood as chain_features
+from torchcrf_scan.inference import pseudo_likelihood as features
 from torchcrf_scan.inference.initialise import Start, choose
+from torchcrf_scan.inference.lattice_likelihood import LatticeChain, lattice_chain
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.portions import Portion
 from torchcrf_scan.model import JointScanCRF
@@ -35,30 +37,49 @@ def pseudo_likelihood(model: JointScanCRF, portion: Portion) -> dict[str, Tensor
 
 
 def likelihood(model: JointScanCRF, portion: Portion, config: LearningConfig) -> dict[str, Tensor]:
-    """Negative exact log-likelihood of each chain per known node, at the motions of the start where they are right (spec 6.5).
+    """Negative log of the exact likelihood of each chain per known node (spec 6.5), `association` and `cluster`, or `lattice`.
 
-    The clustering chain is told the model's own associations in `config.predicted_share` of the pairs (A-28).
+    At the motions of the start where they are right and the portion was surveyed, else at the true ones. Costs a recursion over the
+    points forward and one back; memory N K^2 transitions of every feature.
     """
-    batch, start = portion.batch, start_of(model, portion)
+    nodes = known_nodes(portion.batch).clamp(min=1)
+    terms: dict[str, Tensor] = {}
+    for name, chain, weights in labelled_chains(model, portion, config):
+        uniform = (~chain.known).sum().to(weights) * -math.log(chain.mask[0, 0].numel())  # of the nodes that are cut off
+        terms[name] = -(chain.log_likelihood(weights).sum() - uniform) / nodes
+    return terms | {"total": torch.stack([*terms.values()]).sum()}
+
+
+def labelled_chains(
+    model: JointScanCRF, portion: Portion, config: LearningConfig
+) -> Iterator[tuple[str, features.Chain | LatticeChain, Tensor]]:
+    """The model's chains at the true labels, each with its name and weights.
+
+    The clustering chain beside another is told the model's own associations in `config.predicted_share` of surveyed pairs (A-28).
+    """
+    batch, fitted, inference = portion.batch, model.fitted, model.config.inference
+    chains = model.config.chains
+    learned = fitted.scales, fitted.boosters, inference
+    start = start_of(model, portion) if portion.surveys else None
     generator = torch.Generator().manual_seed(portion.seed)
     view = model.view(batch, model.learned_inputs(batch, start))
-    plugins = training_plugins(view.batch, start.scaled(view.factor), config, generator)
-    chains, inference = model.config.chains, model.config.inference
-    weights, nodes = model.weight_vectors, known_nodes(batch).clamp(min=1)
-    terms: dict[str, Tensor] = {}
+    if start is None:
+        plugins = features.true_plugins(view.batch, inference.clusters - 1)
+    else:
+        plugins = training_plugins(view.batch, start.scaled(view.factor), config, generator)
+    if model.config.coupling == "lattice":
+        yield "lattice", lattice_chain(view, plugins, *learned), torch.cat([fitted.association, fitted.clustering])
+        return
     if chains == "matching":
-        plugins = chain_features.for_background_alone(plugins)
+        plugins = features.for_background_alone(plugins)
     if chains != "clustering":
-        chain = chain_features.association_chain(view, plugins, model.scales, model.boosters, inference)
-        terms["association"] = -chain.log_likelihood(weights[0]).sum() / nodes
+        yield "association", features.association_chain(view, plugins, *learned), fitted.association
+    if chains == "joint" and start is not None:
+        with torch.no_grad():
+            predicted = model(batch.without_truth(), start).association
+        plugins = mix_associations(plugins, predicted, config.predicted_share, generator)
     if chains != "matching":
-        if chains == "joint":
-            with torch.no_grad():
-                predicted = model(batch.without_truth(), start).association
-            plugins = mix_associations(plugins, predicted, config.predicted_share, generator)
-        chain = chain_features.clustering_chain(view, plugins, model.scales)
-        terms["cluster"] = -chain.log_likelihood(weights[1]).sum() / nodes
-    return terms | {"total": torch.stack([*terms.values()]).sum()}
+        yield "cluster", features.clustering_chain(view, plugins, fitted.scales), fitted.clustering
 
 
 @torch.no_grad()
@@ -66,6 +87,12 @@ def start_of(model: JointScanCRF, portion: Portion) -> Start:
     """The motions to begin with, from what was surveyed, or looked for now."""
     if not portion.surveys:
         return model.initialise(portion.batch)
+    with torch.autocast("cpu", enabled=False):  # that is where surveys are looked at
+        return _choose(model, portion)
+
+
+def _choose(model: JointScanCRF, portion: Portion) -> Start:
+    """The motions to begin with, on the batch's device."""
     clusters = 1 if model.config.chains == "matching" else model.config.inference.clusters - 1
     device = portion.batch.source.device
     if device.type == "cpu":

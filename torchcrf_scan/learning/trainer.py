@@ -104,6 +104,8 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
             run.picture(test_pairs[k], answers["joint"][k], step)
         for method, of_method in scores.items():
             run.metrics(method, summarise(of_method))
+        if config.first_order == "none" and scores["joint"]:
+            run.settings(flatten(config), summarise(scores["joint"]))
     if config.first_order != "none" and scores["joint"]:
         with TrainingMonitor(folder, config, config.gradient.steps + 1) as monitor:
             monitor.finished(flatten(config), summarise(scores["joint"]), config.gradient.steps)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
+from torchcrf_scan.baselines.ransac import match_ransac
 from torchcrf_scan.baselines.start import label_nearest
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.inference.initialise import Start
@@ -19,6 +20,7 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import Floats, PairPrediction, ScanPair
 
 BASELINE = "start + gated NN"
+RIVAL = "trimmed ICP + RANSAC"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,17 +41,20 @@ class Answers:
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """Validation pairs; `places` of them in parts, surveyed, are this process's share."""
+    """Validation pairs; `places` of them in parts, surveyed, are this process's share. `rivals`: by place, RANSAC's answers."""
 
     pairs: tuple[ScanPair, ...]
     places: tuple[tuple[int, ...], ...]
     portions: tuple[Portion, ...]
+    rivals: dict[int, PairPrediction]
 
     @classmethod
     def of(cls, pairs: Sequence[ScanPair], part: int, ranks: Ranks, backend: str = "auto") -> Validation:
         """Looks at this process's parts of the pairs, `part` pairs each."""
         parts = [tuple(range(k, min(k + part, len(pairs)))) for k in range(0, len(pairs), part)][ranks.rank :: ranks.world]
-        return cls(tuple(pairs), tuple(parts), tuple(as_portion([pairs[k] for k in places], backend) for places in parts))
+        rivals = {k: match_ransac(pairs[k]) for places in parts for k in places}  # once: it learns nothing
+        portions = tuple(as_portion([pairs[k] for k in places], backend) for places in parts)
+        return cls(tuple(pairs), tuple(parts), portions, rivals)
 
     @torch.no_grad()
     def losses(self, model: JointScanCRF, objective: Objective, ranks: Ranks) -> dict[str, float]:
@@ -70,8 +75,8 @@ class Validation:
 
     @torch.no_grad()
     def answers(self, model: JointScanCRF, ranks: Ranks) -> Answers | None:
-        """The model's answers and those of its start without a random field, in the first process; None in the others."""
-        found: dict[str, dict[int, PairPrediction]] = {"joint": {}, BASELINE: {}}
+        """The answers of the model, of its start without a random field and of RANSAC, in the first process; None in the others."""
+        found: dict[str, dict[int, PairPrediction]] = {"joint": {}, BASELINE: {}, RIVAL: self.rivals}
         moving: dict[int, Floats] = {}
         example = None
         with evaluating(model):

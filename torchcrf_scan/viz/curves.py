@@ -58,7 +58,9 @@ def plot_precision_recall(curves: dict[str, tuple[Floats, ArrayLike]]) -> Figure
     figure, (ax,) = _panels(1)
     for (name, (score, moving)), color in zip(curves.items(), (SOURCE, TARGET, INK, NOTE), strict=False):
         precision, recall, average = precision_recall(score, moving)
-        ax.step(recall, precision, where="post", color=color, label=f"{name}: average precision {average:.2f}")
+        # what a threshold gains in recall has its precision: the area below the curve is the average precision
+        ax.step(np.append(0 * recall[:1], recall), np.append(precision[:1], precision), where="pre", color=color,
+                label=f"{name}: average precision {average:.2f}")  # fmt: skip
     _frame(ax, "moving points", "recall", "precision")
     ax.legend(loc="lower left", fontsize=7)
     return figure

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import wraps
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import hparams
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import Config
@@ -27,12 +27,14 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.viz.curves import plot_confidence, plot_precision_recall, plot_reliability
 from torchcrf_scan.viz.graph import write_graph
 from torchcrf_scan.viz.plots import plot_associations, plot_clusters
+from torchcrf_scan.viz.tensorboard import write_settings
 
 if TYPE_CHECKING:
     from torchcrf_scan.learning.gradient import Report
     from torchcrf_scan.learning.validation import Answers
 
 log = logging.getLogger(__name__)
+P = ParamSpec("P")
 
 GROUPS = {
     "accuracy": ("association_accuracy", "association_within_2", "cluster_accuracy", "iou_moving", "movers_found"),
@@ -52,17 +54,33 @@ LAYOUT = {
 DATA, OUTLIER = len(LOCAL_CHANNELS), len(LOCAL_CHANNELS) + 1  # columns of the boosted margins among the unary features
 
 
+def while_it_can_write(show: Callable[Concatenate[TrainingMonitor, P], None]) -> Callable[Concatenate[TrainingMonitor, P], None]:
+    """A method that says so where the disk is full, and from then on does nothing: training goes on without being watched."""
+
+    @wraps(show)
+    def guarded(monitor: TrainingMonitor, /, *args: P.args, **kwargs: P.kwargs) -> None:
+        if not monitor.is_full:
+            try:
+                show(monitor, *args, **kwargs)
+            except OSError as error:
+                monitor.is_full = True
+                log.warning("nothing more is written for TensorBoard: %s", error)
+
+    return guarded
+
+
 class TrainingMonitor:
     """The events of first-order training, in the folder `training` beside those of the staged fit; a context manager.
 
     Args:
         folder: the run folder. config: of the run.
-        first_step: of a run that goes on; what a broken-off one wrote from there on is hidden.
+        first_step: of a run that goes on; what a broken-off one wrote from there on is hidden. None: all that is there is hidden.
     """
 
     def __init__(self, folder: Path, config: Config, first_step: int | None = None) -> None:
         self.config = config
-        self.writer = SummaryWriter(str(folder / "training"), purge_step=first_step)
+        self.is_full = False
+        self.writer = SummaryWriter(str(folder / "training"), purge_step=first_step or 0)
         self.has_graph = first_step is not None or not config.gradient.graph
         if first_step is None:
             self.writer.add_custom_scalars(LAYOUT)
@@ -71,8 +89,14 @@ class TrainingMonitor:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    @while_it_can_write
+    def close(self) -> None:
+        """Writes what is left."""
         self.writer.close()
 
+    @while_it_can_write
     def stepped(self, model: JointScanCRF, report: Report) -> None:
         """Losses, gradients, weights and speed of one step."""
         seconds = max(report.seconds, 1e-9)
@@ -89,8 +113,9 @@ class TrainingMonitor:
         is_unrolled = self.config.first_order == "unrolled"
         return self.config.unrolled.temperature if is_unrolled else self.config.model.inference.temperature
 
+    @while_it_can_write
     def validated(self, step: int, model: JointScanCRF, losses: Mapping[str, float], answers: Answers) -> None:
-        """Losses, figures of merit beside the baseline's, histograms and pictures of one look at the validation pairs."""
+        """Losses, figures of merit beside the baselines', histograms and pictures of one look at the validation pairs."""
         self._scalars({f"validation/{name}": value for name, value in losses.items()}, step)
         for method, predictions in answers.predictions.items():
             found = summarise([score_pair(pair, answer) for pair, answer in zip(answers.pairs, predictions, strict=True)])
@@ -105,15 +130,10 @@ class TrainingMonitor:
             self.has_graph = True
             write_graph(self.writer, model, batch, start)
 
+    @while_it_can_write
     def finished(self, settings: Mapping[str, Any], metrics: Mapping[str, float], step: int) -> None:
         """The settings of the run beside what came of them, for TensorBoard's `hparams`."""
-        allowed = {name: value if isinstance(value, bool | int | float | str) else str(value) for name, value in settings.items()}
-        final = {f"final/{name}": float(value) for name, value in metrics.items() if np.isfinite(value)}
-        events = self.writer.file_writer
-        assert events is not None
-        for summary in hparams(allowed, final):
-            events.add_summary(summary)
-        self._scalars(final, step)
+        write_settings(self.writer, settings, metrics, step)
 
     def _scalars(self, values: Mapping[str, float], step: int) -> None:
         for name, value in values.items():

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 
 from torchcrf_scan.evaluation.report import Table
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
@@ -47,6 +49,10 @@ class RunLog:
             if np.isfinite(value):
                 self.writer.add_scalar(f"test/{name}/{method}", value, step)
 
+    def settings(self, settings: Mapping[str, Any], summary: Mapping[str, float]) -> None:
+        """The settings of the run beside what came of them."""
+        write_settings(self.writer, settings, summary)
+
     def picture(self, pair: ScanPair, prediction: PairPrediction, step: int = 0) -> None:
         """The pair with its prediction beside the truth: an event and a PNG."""
         figure = plot_pair(pair, prediction)
@@ -60,3 +66,15 @@ class RunLog:
     def table(self, table: Table, step: int = 0) -> None:
         """A table as text, under its title."""
         self.writer.add_text(f"tables/{table.title}", table.to_markdown(), step)
+
+
+def write_settings(writer: SummaryWriter, settings: Mapping[str, Any], metrics: Mapping[str, float], step: int = 0) -> None:
+    """For TensorBoard's `hparams`: settings by their full names, and as `final/NAME` what came of them, where it is a number."""
+    allowed = {name: value if isinstance(value, bool | int | float | str) else str(value) for name, value in settings.items()}
+    final = {f"final/{name}": float(value) for name, value in metrics.items() if np.isfinite(value)}
+    events = writer.file_writer
+    assert events is not None
+    for summary in hparams(allowed, final):
+        events.add_summary(summary)
+    for name, value in final.items():
+        writer.add_scalar(name, value, step)
