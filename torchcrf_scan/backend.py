@@ -57,11 +57,11 @@ def can_decode(model: ModelConfig, points: Tensor, *, needs_gradient: bool, has_
 
 def _why_not_here(points: Tensor) -> str | None:
     """What compiled code would need, where it cannot run."""
+    if torch.compiler.is_compiling():
+        return "an ordinary call, not a compiled or exported one"
     if not is_numba_installed():
         return "numba (pip install torchcrf-scan[fast])"
-    if points.device.type != "cpu":
-        return f"scans on the CPU, got {points.device}"
-    return "an ordinary call, not a compiled or exported one" if torch.compiler.is_compiling() else None
+    return f"scans on the CPU, got {points.device}" if points.device.type != "cpu" else None
 
 
 def _decide(backend: str, reason: str | None) -> bool:

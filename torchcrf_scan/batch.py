@@ -13,11 +13,13 @@ from torch import Tensor
 
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats, PairPrediction, Scan, ScanPair
+from torchcrf_scan.tree import tensor_tree
 
 if TYPE_CHECKING:
     from torchcrf_scan.inference.uncertainty import Uncertainty
 
 
+@tensor_tree
 @dataclass(frozen=True, slots=True)
 class Truth:
     """The annotation of a batch, by point.
@@ -35,6 +37,7 @@ class Truth:
     known: Tensor
 
 
+@tensor_tree
 @dataclass(frozen=True, slots=True)
 class ScanPairBatch:
     """B scan pairs, padded at the end of every scan.
@@ -212,6 +215,7 @@ def _collate_truth(pairs: Sequence[ScanPair], source_mask: Tensor, dtype: torch.
     )
 
 
+@tensor_tree
 @dataclass(frozen=True, slots=True)
 class Prediction:
     """What the model says of a batch; tensors of points, batch first. The README tells what every output's gradient is and costs.

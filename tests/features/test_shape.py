@@ -114,11 +114,11 @@ def test_gradient(closed: bool) -> None:
 def test_neighbour_index() -> None:
     mask = torch.tensor([[True] * 3 + [False], [True] * 4])
     closed = torch.tensor([False, True])
-    assert neighbour_index(mask, closed, 2)[0, :3].tolist() == [2, 2, 2]
-    assert neighbour_index(mask, closed, -2)[0, :3].tolist() == [0, 0, 0]
-    assert neighbour_index(mask, closed, 2)[1].tolist() == [2, 3, 0, 1]
-    assert neighbour_index(mask, closed, -5)[1].tolist() == [3, 0, 1, 2]
-    assert neighbour_index(mask, ~closed, 1)[0, :3].tolist() == [1, 2, 0]  # wraps at the last real point
+    assert neighbour_index(mask, closed, [2])[0, 0, :3].tolist() == [2, 2, 2]
+    assert neighbour_index(mask, closed, [-2])[0, 0, :3].tolist() == [0, 0, 0]
+    assert neighbour_index(mask, closed, [2])[1, 0].tolist() == [2, 3, 0, 1]
+    assert neighbour_index(mask, closed, [-5])[1, 0].tolist() == [3, 0, 1, 2]
+    assert neighbour_index(mask, ~closed, [1])[0, 0, :3].tolist() == [1, 2, 0]  # wraps at the last real point
 
 
 @given(st.integers(1, 3), st.integers(1, 5), st.integers(0, 4), st.integers(1, 3))

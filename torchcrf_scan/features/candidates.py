@@ -48,6 +48,8 @@ def by_motion(
         count: K; time grows with B C N M.
     """
     with torch.no_grad():  # a choice of states, not a function to follow
+        if torch.compiler.is_compiling():  # what is compiled serves any number of pairs, so it cannot count them
+            return _by_motion(source_points, target_points, target_mask, motions, active, count)
         size = max(1, LARGEST_BLOCK // max(1, target_mask.numel()))
         blocks = [_by_motion(part, target_points, target_mask, motions, active, count) for part in source_points.split(size, dim=1)]
         return Candidates(*(torch.cat([getattr(block, f.name) for block in blocks], dim=1) for f in fields(Candidates)))
@@ -57,12 +59,13 @@ def _by_motion(
     source_points: Tensor, target_points: Tensor, target_mask: Tensor, motions: Tensor, active: Tensor, count: int
 ) -> Candidates:
     B, C = active.shape
-    nearest = torch.zeros(B, source_points.shape[1], C, dtype=torch.int64, device=active.device)
+    closest_under = []
     over_motions = source_points.new_full((B, source_points.shape[1], target_points.shape[1]), torch.inf)
     for c in range(C):  # a motion at a time: the largest tensor stays (B, N, M)
         distance = squared_distances(se2.apply(motions[:, c], source_points), target_points, target_mask)
-        nearest[..., c] = torch.where(active[:, c, None], distance.argmin(-1), 0)
+        closest_under.append(torch.where(active[:, c, None], distance.argmin(-1), 0))
         over_motions = torch.where(active[:, c, None, None], torch.minimum(over_motions, distance), over_motions)
+    nearest = torch.stack(closest_under, dim=-1)
     if count == 0 or count >= target_points.shape[1]:
         return Candidates(*every_target(source_points, target_mask), nearest)
     closest, index = over_motions.topk(count, dim=-1, largest=False)

@@ -28,7 +28,7 @@ def association_extension(distance: Tensor, mask: Tensor, sight: FreeSpace, scal
         (B, N, K+1, 5).
     """
     nearest = distance.masked_fill(~mask, torch.inf).amin(-1, keepdim=True)
-    excess = ((distance - nearest) / scales.cluster_distance).clamp(0, FARTHEST_EXCESS)
+    excess = ((distance - nearest) / scales.cluster_distance).clamp(0.0, FARTHEST_EXCESS)
     inliers = torch.stack([-excess, -beyond_gate(distance, scales)], dim=-1)
     outlier = torch.stack([torch.ones_like(sight.hidden), sight.seen_through, sight.hidden], dim=-1)
     return with_outlier(inliers, outlier)

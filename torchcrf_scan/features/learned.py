@@ -17,11 +17,13 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.features.shape import gather_points
+from torchcrf_scan.tree import tensor_tree
 
 EMBEDDING_WEIGHTS = ("embedding", "embedding_data")  # of the association chain, where `FeatureConfig.embedding` is on
 SHORTEST = 1e-3  # length of an embedding below which its direction counts less and less
 
 
+@tensor_tree
 @dataclass(frozen=True, slots=True)
 class ExtraLogUnary:
     """Learned log potentials of source points, in nats; None: none. Padding is not looked at.

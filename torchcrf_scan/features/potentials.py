@@ -72,7 +72,8 @@ class PairView:
         """
         factor = torch.ones_like(batch.dt) if length_unit == "metre" else REFERENCE_UNIT / resolution(batch)
         batch = batch.scaled(factor)
-        source_closed, target_closed = batch.source_closed & wrap_closed, batch.target_closed & wrap_closed
+        both = batch.source_closed, batch.target_closed
+        source_closed, target_closed = both if wrap_closed else (torch.zeros_like(closed) for closed in both)
         here = torch.zeros_like(batch.target_origin)
         return cls(
             batch,
@@ -184,10 +185,14 @@ def clustering_unary(view: PairView, at: clustering.Correspondence, motions: Ten
 
     at: the source points under the motions (B, C, 3), of which `active` (B, C) exist. Returns (B, N, D, 12).
     """
+    return torch.cat([clustering.local_features(at, active, scales), contradictions(view, at, motions, scales)], dim=-1)
+
+
+def contradictions(view: PairView, at: clustering.Correspondence, motions: Tensor, scales: Scales) -> Tensor:
+    """(B, N, D, 8) the clustering chain's extensions, which do not depend on what other clusters there are."""
     carried_back = se2.apply(se2.inverse(motions), at.partner[:, None]).transpose(1, 2)  # (B, N, C, 2)
     sight = look(view.target_sweep, at.moved), look(view.source_sweep, carried_back)
-    extension = clustering_extension(at.residual, *sight, at.is_inlier, scales)
-    return torch.cat([clustering.local_features(at, active, scales), extension], dim=-1)
+    return clustering_extension(at.residual, *sight, at.is_inlier, scales)
 
 
 def possible_clusters(active: Tensor, reach: Tensor | None, points: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,12 +31,15 @@ class ShapeDescriptors:
     radius: Tensor
 
 
-def neighbour_index(mask: Tensor, closed: Tensor, offset: int) -> Tensor:
-    """(B, N) index of the neighbour `offset` points on; clamped to the scan's ends, or wrapped round a closed scan (A-05, A-06)."""
-    count = mask.sum(-1, keepdim=True).clamp(min=1)
-    index = torch.arange(mask.shape[-1], device=mask.device) + offset
+def neighbour_index(mask: Tensor, closed: Tensor, offsets: Sequence[int]) -> Tensor:
+    """(B, K, N) index of the neighbour so many points on; clamped to the scan's ends, or wrapped round a closed scan (A-05, A-06).
+
+    mask: (B, N); closed: (B,); offsets: K.
+    """
+    count = mask.sum(-1)[:, None, None].clamp(min=1)
+    index = torch.arange(mask.shape[-1], device=mask.device) + torch.tensor(offsets, device=mask.device)[:, None]  # (K, N)
     clamped = index.clamp(min=0).minimum(count - 1)
-    return torch.where(closed[:, None], index % count, clamped)
+    return torch.where(closed[:, None, None], index % count, clamped)
 
 
 def gather_points(points: Tensor, index: Tensor) -> Tensor:
@@ -46,19 +50,20 @@ def gather_points(points: Tensor, index: Tensor) -> Tensor:
 
 def describe(points: Tensor, mask: Tensor, closed: Tensor) -> ShapeDescriptors:
     """points: (B, N, 2); mask: (B, N); closed: (B,). The descriptors of padding are finite and mean nothing."""
-    arms = {k: gather_points(points, neighbour_index(mask, closed, k)) - points for k in range(-max(ORDERS), max(ORDERS) + 1)}
-
-    def length(vector: Tensor) -> Tensor:
-        return torch.linalg.vector_norm(vector, dim=-1)
+    most = max(ORDERS)
+    arms = gather_points(points, neighbour_index(mask, closed, range(-most, most + 1))) - points[:, None]  # (B, 11, N, 2)
+    lengths = torch.linalg.vector_norm(arms, dim=-1)
+    gaps = torch.linalg.vector_norm(arms.diff(dim=1), dim=-1)  # (B, 10, N) from each of them to the next
 
     def along(k: int, sign: int) -> Tensor:
-        return torch.stack([length(arms[sign * (step + 1)] - arms[sign * step]) for step in range(k)]).sum(0)
+        return torch.stack([gaps[:, most + step if sign > 0 else most - 1 - step] for step in range(k)]).sum(0)
 
+    after, before = (torch.stack([arms[:, most + sign * k] for k in ORDERS], -2) for sign in (1, -1))  # (B, N, 3, 2)
     return ShapeDescriptors(
-        distance=torch.stack([torch.stack([length(arms[k]), length(arms[-k])], -1) for k in ORDERS], -2),
+        distance=torch.stack([torch.stack([lengths[:, most + k], lengths[:, most - k]], -1) for k in ORDERS], -2),
         geodesic=torch.stack([torch.stack([along(k, 1), along(k, -1)], -1) for k in ORDERS], -2),
-        angle=torch.stack([_angle(arms[-k], arms[k]) for k in ORDERS], -1),
-        radius=length(points),
+        angle=_angle(before, after),
+        radius=torch.linalg.vector_norm(points, dim=-1),
     )
 
 

@@ -24,6 +24,8 @@ from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
 from torchcrf_scan.inference.hypothesis_features import hypothesis_features
 from torchcrf_scan.inference.movers import HypothesisScore, select
 from torchcrf_scan.inference.surface import Surface
+from torchcrf_scan.inference.uncertainty import surface_tangents
+from torchcrf_scan.tree import tensor_tree
 
 CONSIDERED = 0.1  # probability from which a mover is considered; the score alone accepts from its own threshold
 FEWEST_POINTS = 3  # a scan with fewer says nothing of the motion
@@ -36,6 +38,7 @@ REACH_UNITS = 4.0  # units of resolution beyond it may still be the object
 FOOTPRINT = 0.0175  # radians; spacing of a one-degree scanner on a surface that faces it
 
 
+@tensor_tree
 @dataclass(frozen=True, slots=True)
 class Start:
     """Motions to begin with.
@@ -55,6 +58,16 @@ class Start:
     target_tangents: Tensor
     reach: Tensor | None = None
     log_odds: Tensor | None = None
+
+    @classmethod
+    def at(cls, batch: ScanPairBatch, motions: Tensor, active: Tensor) -> Start:
+        """The start where somebody else knows the motions; associations and the surfaces' directions follow from them.
+
+        motions: (B, C, 3), active: (B, C). No step depends on a tensor's value.
+        """
+        tangents, is_found = surface_tangents(batch.target, batch.target_mask, batch.range_noise)
+        association = nearest_association(batch, motions, active)
+        return cls(motions, active, association, torch.where(is_found[..., None], tangents, torch.zeros_like(tangents)))
 
     def considered(self) -> Start:
         """The same with all movers that the score does not rule out, for the model to decide about."""

@@ -93,9 +93,14 @@ class Round:
 
 def decode(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> Prediction:
     """Labels and motions of a batch by the sweep schedule; differentiable through beliefs and, where soft, through motions."""
+    last = settle(view, start, parameters, model)
+    return read_out(view, start, last.state, parameters, model.inference, last.converged, last.iterations)
+
+
+def settle(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> Round:
+    """What B pairs have come to after the last round, clusters that turned out to be one merged."""
     last = rounds(view, start, parameters, model)[-1]
-    merged = merge_alike(view, last.state, parameters.scales.cluster_distance)
-    return read_out(view, start, merged, parameters, model.inference, last.converged, last.iterations)
+    return replace(last, state=merge_alike(view, last.state, parameters.scales.cluster_distance))
 
 
 def rounds(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> list[Round]:
@@ -105,8 +110,8 @@ def rounds(view: PairView, start: Start, parameters: Parameters, model: ModelCon
     start = start if is_chosen else start.considered()
     state = first_state(view, start, parameters, config)
     before = state
-    converged = torch.zeros(len(batch), dtype=torch.bool, device=batch.source.device)
-    iterations = torch.zeros(len(batch), dtype=torch.int64, device=batch.source.device)
+    converged = torch.zeros_like(batch.source_closed)
+    iterations = torch.zeros_like(converged, dtype=torch.int64)
     found = [Round(state, converged, iterations)]
     for done in range(config.iterations):
         if done < SELECTION_ROUNDS and not is_chosen:
@@ -116,7 +121,7 @@ def rounds(view: PairView, start: Start, parameters: Parameters, model: ModelCon
             after = damp(after, state, before)
             after = keep_settled(after, state, converged)
         before, state = state, after
-        iterations = iterations + (~converged | (not config.stop_early)).long()
+        iterations = iterations + ((~converged).long() if config.stop_early else 1)
         converged = converged | has_settled(state, before, config)
         found.append(Round(state, converged, iterations))
         if config.stop_early and bool(converged.all()):
@@ -350,13 +355,17 @@ def merge_alike(view: PairView, state: State, scale: Tensor) -> State:
     members = (state.cluster[..., None] == torch.arange(C, device=state.cluster.device)).to(motions.value)
     moved = se2.apply(motions.value, view.batch.source[:, None])  # (B, C, N, 2)
     total = members.sum(1)  # (B, C)
+    usable = motions.active & (total > 0)
     for low in range(C - 1):
+        later = slice(low + 1, C)
+        rotation, _ = se2.distance(motions.value[:, low, None], motions.value[:, later])  # (B, C - low - 1)
+        gap = torch.linalg.vector_norm(moved[:, low, None] - moved[:, later], dim=-1)  # (B, C - low - 1, N)
+        of_low = (gap * members[:, None, :, low]).sum(-1) / total[:, low, None].clamp(min=1)
+        of_later = (gap * members[..., later].mT).sum(-1) / total[:, later].clamp(min=1)
+        is_near = (rotation < MERGE_ROTATION) & (torch.maximum(of_low, of_later) < scale)
+        alike = usable[:, low, None] & usable[:, later] & is_near
         for high in range(low + 1, C):
-            rotation, _ = se2.distance(motions.value[:, low], motions.value[:, high])
-            gap = torch.linalg.vector_norm(moved[:, low] - moved[:, high], dim=-1)  # (B, N)
-            apart = torch.stack([(gap * members[..., k]).sum(-1) / total[:, k].clamp(min=1) for k in (low, high)]).amax(0)
-            both = motions.active[:, low] & motions.active[:, high] & (total[:, low] > 0) & (total[:, high] > 0)
-            state = join(state, both & (rotation < MERGE_ROTATION) & (apart < scale), low, high)
+            state = join(state, alike[:, high - low - 1], low, high)
     return state
 
 

@@ -64,7 +64,7 @@ def lattice_messages(potentials: LatticePotentials, temperature: float = 0.0) ->
         message = reduce_states(of_pairs + between[:, None], 2, temperature)
         message = normalise(message.flatten(1)).view_as(here)
         messages.append(message)
-    forward, backward = torch.stack(messages, dim=1).chunk(2)
+    forward, backward = torch.stack(messages, dim=1).unflatten(0, (2, potentials.log_unary.shape[0])).unbind()
     return forward, backward.flip(1)
 
 
@@ -139,5 +139,5 @@ def _sum_messages(log_unary: Tensor, tables: Tensor, clusters: Tensor) -> tuple[
         outgoing, peak = _exp_shifted(here + message)
         message = torch.log((table @ outgoing[:, None] @ cluster).sum(1)) + peak
         messages.append(message)
-    forward, backward = torch.stack(messages, dim=1).chunk(2)
+    forward, backward = torch.stack(messages, dim=1).unflatten(0, (2, log_unary.shape[0])).unbind()
     return forward, backward.flip(1)

@@ -53,8 +53,9 @@ def chain_messages(log_unary: Tensor, log_pairwise: Tensor, temperature: float =
     outgoing = both_unary[:, :-1, :, None] + both_pairwise  # (2B, N-1, S, S)
     first = torch.zeros_like(both_unary[:, :1])
     B, _, S = log_unary.shape
-    pass_on = pass_in_blocks if B * S**3 <= LARGEST_BLOCKS else pass_node_by_node
-    forward, backward = torch.cat([first, pass_on(outgoing, temperature)], dim=1).chunk(2)
+    pairs = 1 if torch.compiler.is_compiling() else B  # what is compiled serves any number of pairs, and grows with the steps
+    pass_on = pass_in_blocks if pairs * S**3 <= LARGEST_BLOCKS else pass_node_by_node
+    forward, backward = torch.cat([first, pass_on(outgoing, temperature)], dim=1).unflatten(0, (2, B)).unbind()
     return forward, backward.flip(1)
 
 
@@ -76,7 +77,7 @@ def pass_in_blocks(outgoing: Tensor, temperature: float) -> Tensor:
     B, E, S, _ = outgoing.shape
     length = max(1, math.isqrt(max(E, 1)))
     missing = -E % length
-    stay = torch.full((S, S), -torch.inf, dtype=outgoing.dtype, device=outgoing.device).fill_diagonal_(0.0)
+    stay = outgoing.new_zeros(S, S).masked_fill(~torch.eye(S, dtype=torch.bool, device=outgoing.device), -torch.inf)
     edges = torch.cat([outgoing, stay.expand(B, missing, S, S)], dim=1).unflatten(1, (-1, length))  # (B, blocks, length, S, S)
     across = list(edges[:, :, :1].unbind(2))  # from the entry of every block to its every edge
     for edge in edges.unbind(2)[1:]:
@@ -98,6 +99,8 @@ def log_partition(log_unary: Tensor, log_pairwise: Tensor, temperature: float = 
 
     Above temperature 0 its gradient are the marginals, from a second pass; it is not differentiable twice.
     """
+    if torch.compiler.is_compiling():
+        return _total_by_halves(log_unary, log_pairwise, temperature)
     if temperature > 0:
         return _LogPartition.apply(log_unary, log_pairwise, temperature)[0]
     return _running_totals(log_unary, log_pairwise, temperature)[-1]
@@ -109,6 +112,18 @@ def _running_totals(log_unary: Tensor, log_pairwise: Tensor, temperature: float)
     for node, edge in zip(log_unary.unbind(1)[1:], log_pairwise.unbind(1), strict=True):
         totals.append(reduce_states(totals[-1][:, :, None] + edge, 1, temperature) + node)
     return [*totals, reduce_states(totals[-1], -1, temperature)]
+
+
+def _total_by_halves(log_unary: Tensor, log_pairwise: Tensor, temperature: float) -> Tensor:
+    """(B,) the same total in log2(N) steps, each joining neighbouring stretches: S times the arithmetic, but a small graph."""
+    scores = log_pairwise + log_unary[:, 1:, None]  # (B, E, S, S) of every stretch, by the state before it and its last state
+    while (E := scores.shape[1]) > 1:
+        left, right = scores[:, : E - E % 2 : 2], scores[:, 1::2]
+        joined = reduce_states(left[..., None] + right[:, :, None], -2, temperature)
+        scores = torch.cat([joined, scores[:, E - E % 2 :]], dim=1)
+    last = log_unary[:, 0, :, None]
+    last = reduce_states(last + scores[:, 0], 1, temperature) if E else last[..., 0]
+    return reduce_states(last, -1, temperature)
 
 
 class _LogPartition(torch.autograd.Function):

@@ -72,7 +72,7 @@ def gauss_newton_step(moved: Tensor, partner: Tensor, tangent: Tensor, weights: 
     right = torch.stack([-(weights * dot_metric(a, residual)).sum(-1) for a in basis], -1)
     scale = (weights * (lever**2).sum(-1)).sum(-1)
     damping = torch.stack([TURN_DAMPING * scale + LEAST_DAMPING * total, SHIFT_DAMPING * total, SHIFT_DAMPING * total], dim=-1)
-    step = torch.linalg.solve(normal + torch.diag_embed(damping), right)
+    step, _ = torch.linalg.solve_ex(normal + torch.diag_embed(damping), right)  # damped, so there is no failure to look for
     theta, shift = step[..., 0].clamp(-LARGEST_TURN, LARGEST_TURN), step[..., 1:]
     pivot = centre[..., 0, :]
     return torch.cat([theta[..., None], pivot - se2.rotate(theta, pivot) + shift], dim=-1)

@@ -10,7 +10,7 @@ The least worth of a pair goes first, for two that explain the same points are e
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.learned import clustering_extra
-from torchcrf_scan.features.potentials import PairView, clustering_potentials, clustering_unary, find_candidates, possible_clusters
+from torchcrf_scan.features.potentials import PairView, clustering_potentials, contradictions, find_candidates, possible_clusters
 from torchcrf_scan.inference.messages import log_partition, silence_padding
 
 if TYPE_CHECKING:
@@ -62,42 +62,75 @@ class ClusterPotential(nn.Module):
 def discard_vacuous(view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig) -> State:
     """The state without the clusters that are worth less than nothing. Movers only; needs `start.log_odds`."""
     assert start.log_odds is not None
-    for _ in range(state.motions.active.shape[1] - 1):
-        if config.stop_early and not bool(state.motions.active[:, 1:].any()):
+    chain = ConsideredChain.of(view, start, state, parameters, config)
+    active = state.motions.active
+    for _ in range(active.shape[1] - 1):
+        if config.stop_early and not bool(active[:, 1:].any()):
             break
-        worth = parameters.potential(evidence(view, start, state, parameters, config), start.log_odds)  # (B, C)
+        worth = parameters.potential(chain.evidence(active), start.log_odds)  # (B, C)
         is_mover = torch.arange(worth.shape[1], device=worth.device) > 0
-        least, which = worth.masked_fill(~(state.motions.active & is_mover), torch.inf).min(-1)
+        least, which = worth.masked_fill(~(active & is_mover), torch.inf).min(-1)
         is_vacuous = (which[:, None] == torch.arange(worth.shape[1], device=worth.device)) & (least < 0)[:, None]
         if config.stop_early and not bool(is_vacuous.any()):
             break
-        state = replace(state, motions=replace(state.motions, active=state.motions.active & ~is_vacuous))
-    return state
+        active = active & ~is_vacuous
+    return replace(state, motions=replace(state.motions, active=active))
 
 
 @torch.no_grad()
 def evidence(view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig) -> Tensor:
-    """(B, C) log Z of the clustering chain at the present motions and associations, minus that without the cluster; 0: absent.
+    """`ConsideredChain.evidence` of the state's own clusters."""
+    return ConsideredChain.of(view, start, state, parameters, config).evidence(state.motions.active)
 
-    Without it, its points still count as explained (C2), else its absence would speak for them being outliers.
+
+@dataclass(frozen=True, slots=True)
+class ConsideredChain:
+    """The clustering chain at one state's motions and associations, whichever of its clusters are there.
+
+    Attributes:
+        view, start, parameters: as in `joint.decode`.
+        at: where points go and what they meet. beside_local: (B, N, D, 8) features that ask for no other cluster.
+        pairwise: (B, N-1, D, D, 8).
     """
-    batch, motions = view.batch, state.motions
-    found = find_candidates(view, motions.value, motions.active, config)
-    at = clustering.correspond(batch.source, batch.target, motions.value, found.nearest, state.association)
-    local = clustering_unary(view, at, motions.value, motions.active, parameters.scales)
-    pairwise = clustering.pairwise_features(batch.source, at, parameters.scales)
 
-    B, C = motions.active.shape
-    there = motions.active.expand(C, B, C).clone()  # row 0: all clusters; row k: without cluster k
-    there[1:] &= ~torch.eye(C, dtype=torch.bool, device=there.device)[1:, None]
-    possible = torch.stack([possible_clusters(row, start.reach, batch.source.shape[1]) for row in there])  # (C, B, N, D)
-    extra = clustering_extra(view.learned, C + 1)
-    log_unary, log_pairwise = clustering_potentials(local, pairwise, torch.ones_like(possible[0]), parameters.clustering, extra)
-    totals = log_partition(
-        *silence_padding(
-            log_unary.masked_fill(~possible, -torch.inf).flatten(0, 1),
-            log_pairwise.expand(C, *log_pairwise.shape).flatten(0, 1),
-            batch.source_mask.expand(C, *batch.source_mask.shape).flatten(0, 1),
-        )
-    ).view(C, B)
-    return (totals[0] - totals).mT
+    view: PairView
+    start: Start
+    parameters: Parameters
+    at: clustering.Correspondence
+    beside_local: Tensor
+    pairwise: Tensor
+
+    @classmethod
+    def of(cls, view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig) -> ConsideredChain:
+        """Arguments as in `discard_vacuous`."""
+        batch, motions, scales = view.batch, state.motions, parameters.scales
+        found = find_candidates(view, motions.value, motions.active, config)
+        at = clustering.correspond(batch.source, batch.target, motions.value, found.nearest, state.association)
+        pairwise = clustering.pairwise_features(batch.source, at, scales)
+        return cls(view, start, parameters, at, contradictions(view, at, motions.value, scales), pairwise)
+
+    def evidence(self, active: Tensor) -> Tensor:
+        """(B, C) log Z of the chain of the clusters that are there minus that without the cluster; 0: absent.
+
+        Without it, its points still count as explained (C2), else its absence would speak for them being outliers.
+
+        active: (B, C), some or all of the state's.
+        """
+        mask = self.view.batch.source_mask
+        B, C = active.shape
+        local = torch.cat([clustering.local_features(self.at, active, self.parameters.scales), self.beside_local], dim=-1)
+        is_other = ~torch.eye(C, dtype=torch.bool, device=active.device)
+        is_other = torch.cat([torch.ones_like(is_other[:1]), is_other[1:]])  # row 0: all clusters; row k: without cluster k
+        there = active & is_other[:, None]  # (C, B, C)
+        possible = torch.stack([possible_clusters(row, self.start.reach, mask.shape[1]) for row in there])  # (C, B, N, D)
+        extra = clustering_extra(self.view.learned, C + 1)
+        every = torch.ones_like(possible[0])
+        log_unary, log_pairwise = clustering_potentials(local, self.pairwise, every, self.parameters.clustering, extra)
+        totals = log_partition(
+            *silence_padding(
+                log_unary.masked_fill(~possible, -torch.inf).flatten(0, 1),
+                log_pairwise.expand(C, *log_pairwise.shape).flatten(0, 1),
+                mask.expand(C, *mask.shape).flatten(0, 1),
+            )
+        ).view(C, B)
+        return (totals[0] - totals).mT

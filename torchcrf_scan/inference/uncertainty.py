@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import safe_atan2
 from torchcrf_scan.inference.motion import Support
+from torchcrf_scan.tree import tensor_tree
 
 LEAST_SHARE = 0.02  # of the best possible information per point; in a direction with less the motion counts as not observed
 STRETCH, STEPS = 10.0, 2.0  # a surface's direction comes from the points within so many noises and steps to the next point
@@ -28,6 +29,7 @@ MOST_CERTAIN = -50.0  # log-beliefs below this are as good as impossible
 WITHIN = 2  # target points; an association this near is the same answer, since annotations err by one themselves
 
 
+@tensor_tree
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
     """How well the motions of a batch are known.
@@ -154,7 +156,7 @@ class Linearisation:
         residual = moved - support.partner[:, None]
         weights, along = support.weights, torch.zeros_like(moved)
         if metric != "point":
-            squared_scale = (scale**2).expand(len(source))[:, None, None]
+            squared_scale = (scale**2).expand(source.shape[0])[:, None, None]
             weights = weights / (1 + (residual**2).sum(-1) / squared_scale)
             along = moved_tangents(source, support, motions, noise)
         total = weights.sum(-1).clamp(min=1e-9)  # (B, C)
@@ -292,7 +294,7 @@ def cluster_log_odds(prediction: Answers) -> Tensor:
     """(B, N) log-odds of the chosen cluster."""
     states = prediction.log_cluster.shape[-1]
     state = torch.where(prediction.cluster >= 0, prediction.cluster, states - 1)
-    return log_odds(prediction.log_cluster, nn.functional.one_hot(state, states).bool())
+    return log_odds(prediction.log_cluster, state[..., None] == torch.arange(states, device=state.device))
 
 
 def log_odds(log_beliefs: Tensor, chosen: Tensor) -> Tensor:

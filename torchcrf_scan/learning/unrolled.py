@@ -203,7 +203,7 @@ def match_clusters(batch: ScanPairBatch, state: State, temperature: float) -> Te
     G, C = ask.shape[1:]
     row, column = torch.arange(G, device=ask.device), torch.arange(C, device=ask.device)
     alike = torch.where(ask & (row > 0)[:, None] & (column > 0), alike, 0.0)
-    slots = torch.where(row > 0, -1, 0).expand(len(batch), G)
+    slots = torch.where(row > 0, -1, 0).expand(batch.source.shape[0], G)
     for _ in range(min(G, C) - 1):
         most, place = alike.flatten(1).max(-1)
         is_row, is_column = row == (place // C)[:, None], column == (place % C)[:, None]  # (B, G), (B, C)

@@ -1,0 +1,234 @@
+"""The unrolled rounds compiled, exported, as ONNX, and as a function of the weights: always the answers of the model itself."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from support import normal
+from torch import Tensor
+from torch.export import ExportedProgram
+
+from torchcrf_scan import InferenceConfig, JointScanCRF, ModelConfig, ScanPair, ScanPairBatch
+from torchcrf_scan.config import SimulatorConfig
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.export import (
+    OPSET,
+    OUTPUTS,
+    UnrolledDecoder,
+    count_below,
+    decoder_inputs,
+    eliminate,
+    export_onnx,
+    export_program,
+    middle_of_known,
+)
+from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.scan import Scan
+
+BEAMS = 31
+SETTINGS: dict[str, Any] = {"clusters": 3, "iterations": 1, "stop_early": False, "backend": "eager"}
+
+
+@pytest.fixture(scope="module")
+def model() -> JointScanCRF:
+    return JointScanCRF.from_pretrained(**SETTINGS)
+
+
+def cut(pair: ScanPair, beams: int) -> ScanPair:
+    """The first beams of both scans."""
+    source, target = (Scan.from_ranges(s.ranges[:beams], s.bearings[:beams]) for s in (pair.source, pair.target))
+    return ScanPair(source, target, pair.dt)
+
+
+def batches() -> list[ScanPairBatch]:
+    """Simulated pairs of one padded size: two pairs, one pair that is shorter, three pairs of which one has one point."""
+    pairs = [simulate_pairs(SimulatorConfig(beams=BEAMS, dropout=0.0), 1, 1, seed)[0] for seed in range(4)]
+    longest = 2 * [max(len(scan) for pair in pairs for scan in (pair.source, pair.target))]
+    groups = [pairs[:2], [cut(pairs[2], 20)], [pairs[3], cut(pairs[0], 1), pairs[1]]]
+    return [padded(ScanPairBatch.collate(group).without_truth(), *longest) for group in groups]
+
+
+def padded(batch: ScanPairBatch, n: int, m: int) -> ScanPairBatch:
+    """The batch with scans of n and m points."""
+
+    def longer(values: Tensor, points: int) -> Tensor:
+        return torch.cat([values, values.new_zeros(len(values), points - values.shape[1], *values.shape[2:])], dim=1)
+
+    sizes = {"source": n, "source_mask": n, "target": m, "target_mask": m}
+    return replace(batch, **{name: longer(getattr(batch, name), points) for name, points in sizes.items()})
+
+
+@pytest.fixture(scope="module")
+def cases(model: JointScanCRF) -> list[tuple[ScanPairBatch, Start]]:
+    return [(batch, model.initialise(batch)) for batch in batches()]
+
+
+def assert_same(found: dict[str, Tensor], expected: Any, tolerance: float = 0.0) -> None:
+    """Labels equal, numbers within the tolerance. expected: a `Prediction`."""
+    for name in OUTPUTS:
+        here, there = found[name], getattr(expected, name).detach()
+        if here.is_floating_point():
+            torch.testing.assert_close(here, there, rtol=tolerance, atol=tolerance, msg=lambda text, of=name: f"{of}: {text}")
+        else:
+            assert torch.equal(here, there), name
+
+
+# --- torch.compile --------------------------------------------------------------------------------------------------------------
+
+
+def test_compiled_without_a_graph_break(model: JointScanCRF, cases: list[tuple[ScanPairBatch, Start]]) -> None:
+    batch, start = cases[0]
+    with torch.no_grad():
+        found = torch.compile(model, backend="aot_eager", fullgraph=True)(batch, start)
+        expected = model(batch, start)
+    assert_same({name: getattr(found, name) for name in OUTPUTS}, expected)
+    torch.testing.assert_close(found.uncertainty.covariance, expected.uncertainty.covariance)
+
+
+# --- torch.export and ONNX ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def program(model: JointScanCRF, cases: list[tuple[ScanPairBatch, Start]]) -> ExportedProgram:
+    return export_program(model, *cases[0])
+
+
+def test_the_program_answers_as_the_model_for_any_number_of_pairs(
+    program: ExportedProgram, model: JointScanCRF, cases: list[tuple[ScanPairBatch, Start]], tmp_path: Path
+) -> None:
+    torch.export.save(program, tmp_path / "program.pt2")
+    loaded = torch.export.load(tmp_path / "program.pt2").module()
+    for batch, start in cases:
+        with torch.no_grad():
+            assert_same(loaded(**decoder_inputs(batch, start)), model(batch, start), 1e-6)
+
+
+def test_motions_alone_are_a_start(model: JointScanCRF, cases: list[tuple[ScanPairBatch, Start]]) -> None:
+    decoder = UnrolledDecoder(model)
+    for batch, start in cases:
+        motions = start.motions[:, :1]
+        with torch.no_grad():
+            found = decoder(**decoder_inputs(batch, motions))
+            expected = model(batch, Start.at(batch, motions, torch.ones_like(motions[..., 0], dtype=torch.bool)))
+        assert_same(found, expected)
+        known = (found["association"] >= 0).sum()
+        assert known > 0.5 * batch.source_mask.sum()
+
+
+def test_onnxruntime_answers_as_the_model(
+    model: JointScanCRF, program: ExportedProgram, cases: list[tuple[ScanPairBatch, Start]], tmp_path: Path
+) -> None:
+    onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    export_onnx(tmp_path / "model.onnx", program)
+    assert [path.name for path in tmp_path.iterdir()] == ["model.onnx"]
+    assert {entry.domain: entry.version for entry in onnx.load(tmp_path / "model.onnx").opset_import}[""] == OPSET
+    session = runtime.InferenceSession(tmp_path / "model.onnx")
+    names = [given.name for given in session.get_inputs()]
+    assert tuple(out.name for out in session.get_outputs()) == OUTPUTS
+    for batch, start in cases:
+        inputs = decoder_inputs(batch, start)
+        values = session.run(None, {name: inputs[name].numpy() for name in names})
+        with torch.no_grad():
+            assert_same(dict(zip(OUTPUTS, map(torch.from_numpy, values), strict=True)), model(batch, start), 1e-4)
+
+
+def test_what_cannot_be_exported_says_so(model: JointScanCRF) -> None:
+    flooding = JointScanCRF(ModelConfig(inference=InferenceConfig(schedule="flooding")))
+    with pytest.raises(ValueError, match="schedule: expected sweep for a model to export, got flooding"):
+        UnrolledDecoder(flooding)
+    early = JointScanCRF()
+    inference = UnrolledDecoder(early, iterations=3).model.config.inference
+    assert (inference.stop_early, inference.iterations, inference.backend) == (False, 3, "eager")
+    assert early.config.inference.stop_early
+
+
+def test_decompositions_equal_the_operators() -> None:
+    values, sorted_rows = normal(3, 20), normal(3, 8, seed=1).sort(-1).values
+    values[:, :8] = sorted_rows  # ties
+    sorted_rows[1, 5:] = torch.inf
+    assert torch.equal(count_below(sorted_rows, values), torch.searchsorted(sorted_rows, values))
+    for known in (0, 1, 2, 7, 20):
+        some = values.masked_fill(torch.arange(20) >= known, torch.nan)
+        torch.testing.assert_close(middle_of_known(some, 1)[0], some.nanmedian(1).values, rtol=0, atol=0, equal_nan=True)
+    root = normal(5, 4, 3, 3, seed=2)
+    matrix, right = root @ root.mT + 0.1 * torch.eye(3), normal(5, 4, 3, seed=3)
+    torch.testing.assert_close(eliminate(matrix, right)[0], torch.linalg.solve(matrix, right))
+
+
+# --- a function of the weights --------------------------------------------------------------------------------------------------
+
+
+def soft(features: dict[str, Any] | None = None) -> JointScanCRF:
+    return JointScanCRF.from_pretrained(features=features, **{**SETTINGS, "motion_weights": "soft", "temperature": 1.0})
+
+
+def weight_sets(model: JointScanCRF, count: int) -> list[dict[str, Tensor]]:
+    """The model's weights, each set disturbed otherwise."""
+    draws = normal(count, len(list(model.parameters()))).float()
+    return [
+        {name: value.detach() + 0.1 * draw for (name, value), draw in zip(model.named_parameters(), row, strict=True)}
+        for row in draws
+    ]
+
+
+def answers(model: JointScanCRF, weights: dict[str, Tensor], batch: ScanPairBatch, start: Start) -> tuple[Tensor, ...]:
+    found = torch.func.functional_call(model, weights, (batch, start))
+    return found.log_association.exp(), found.log_cluster.exp(), found.motions
+
+
+def test_other_weights_are_another_model(cases: list[tuple[ScanPairBatch, Start]]) -> None:
+    batch, start = cases[0]
+    model, (weights,) = soft(), weight_sets(soft(), 1)
+    with torch.no_grad():
+        other = soft()
+        other.load_state_dict({**other.state_dict(), **weights})
+        found, expected = answers(model, weights, batch, start), answers(other, {}, batch, start)
+        usual = answers(model, {}, batch, start)
+    for one, two in zip(found, expected, strict=True):
+        assert torch.equal(one, two)
+    assert not torch.allclose(found[0], usual[0], atol=1e-3)
+
+
+def test_a_state_dict_brings_the_program_s_answers_along(cases: list[tuple[ScanPairBatch, Start]]) -> None:
+    batch, start = cases[2]
+    model = soft()
+    with torch.no_grad():
+        for name, value in weight_sets(model, 1)[0].items():
+            model.get_parameter(name).copy_(value)
+        again = JointScanCRF(model.config)
+        again.load_state_dict(model.state_dict())
+        assert_same(UnrolledDecoder(again)(**decoder_inputs(batch, start)), model(batch, start))
+
+
+def test_many_weights_at_once(cases: list[tuple[ScanPairBatch, Start]]) -> None:
+    """`vmap` over weights is the loop over them, and so are the gradients through it."""
+    batch, start = cases[0]
+    model = soft()
+    sets = weight_sets(model, 3)
+    stacked = {name: torch.stack([weights[name] for weights in sets]) for name in sets[0]}
+
+    def loss(weights: dict[str, Tensor]) -> Tensor:
+        association, cluster, motions = answers(model, weights, batch, start)
+        return association[..., 0].sum() + cluster[..., 0].sum() + motions.sum()
+
+    many = torch.func.vmap(lambda weights: answers(model, weights, batch, start))(stacked)
+    slopes = torch.func.vmap(torch.func.grad(loss))(stacked)
+    for k, weights in enumerate(sets):
+        for value, expected in zip(many, answers(model, weights, batch, start), strict=True):
+            torch.testing.assert_close(value[k], expected, rtol=1e-4, atol=1e-5)
+        alone = torch.func.grad(loss)(weights)
+        for name, slope in alone.items():
+            torch.testing.assert_close(slopes[name][k], slope, rtol=1e-3, atol=1e-3)
+    assert any(bool(slope.abs().sum() > 0) for slope in slopes.values())
+
+
+def test_a_dataclass_is_a_tree_of_its_tensors(cases: list[tuple[ScanPairBatch, Start]]) -> None:
+    from torch.utils import _pytree as pytree
+
+    for value in cases[0]:
+        leaves, spec = pytree.tree_flatten(value)
+        again = pytree.tree_unflatten(leaves, spec)
+        assert all(getattr(again, f.name) is getattr(value, f.name) for f in fields(value))
