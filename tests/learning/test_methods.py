@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
-from torchcrf_scan.config import Config
+from torchcrf_scan.config import Config, EncoderConfig, GradientConfig
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.methods import (
+    ENCODED,
     EXACT,
     JOINT,
     LATTICE,
@@ -42,7 +43,7 @@ def answers(models: Models, small_pairs: list[ScanPair]) -> dict[str, Answer]:
 
 def test_every_row_that_can_be_there_is_there(answers: dict[str, Answer]) -> None:
     assert len(set(METHODS)) == len(METHODS)
-    assert set(answers) == set(METHODS) - (set(LIBRARIES) - set(installed_libraries()))
+    assert set(answers) == set(METHODS) - {ENCODED} - (set(LIBRARIES) - set(installed_libraries()))
 
 
 def test_a_library_has_its_row_where_it_is_installed(
@@ -51,7 +52,7 @@ def test_a_library_has_its_row_where_it_is_installed(
     still = answers["all background"].prediction
     monkeypatch.setattr("torchcrf_scan.learning.methods.installed_libraries", lambda: dict.fromkeys(LIBRARIES, lambda _: still))
     found = answer(models, small_pairs[5])
-    assert set(found) == set(METHODS)
+    assert set(found) == set(METHODS) - {ENCODED}
     assert all(found[name].prediction is still for name in LIBRARIES)
 
 
@@ -124,6 +125,29 @@ def test_the_joint_models_share_their_features(models: Models) -> None:
         assert all(same) or name.split(".")[0] in OWN, name
     weights = [torch.cat(model.weight_vectors).detach() for model in models.joint.values()]
     assert all(not torch.equal(one, other) for one, other in itertools.combinations(weights, 2))
+
+
+def test_a_model_with_an_encoder_goes_on_from_the_joint_model(
+    study: Study, models: Models, small_pairs: list[ScanPair], small_config: Config
+) -> None:
+    config = replace(
+        small_config,
+        model=replace(small_config.model, encoder=EncoderConfig(width=4, dilations=(1,))),
+        gradient=GradientConfig(objective="likelihood", steps=2, batch_size=2, part=2, workers=0, fresh=0.0),
+        experiment=replace(small_config.experiment, joint_alone=True),
+    )
+    both = fit_models(study, range(4), config, variants=True)
+    assert list(both.joint) == [JOINT, ENCODED]
+    plain, encoded = both.joint.values()
+    assert plain.encoder is None
+    assert encoded.encoder is not None
+    assert bool((encoded.encoder.last.weight[:2] != 0).any())
+    assert torch.equal(plain.boosters.data.table, models.joint[JOINT].boosters.data.table)
+    assert torch.equal(encoded.boosters.data.table, plain.boosters.data.table)
+    assert not torch.equal(torch.cat(encoded.weight_vectors), torch.cat(plain.weight_vectors))
+    assert list(answer(both, small_pairs[5])) == [JOINT, ENCODED]
+    with pytest.raises(ValueError, match=r"gradient\.objective: expected one for a model with an encoder"):
+        fit_models(study, range(4), replace(config, gradient=GradientConfig()), variants=False)
 
 
 def test_every_joint_model_is_calibrated_on_what_it_was_fitted_on(study: Study, models: Models, small_config: Config) -> None:

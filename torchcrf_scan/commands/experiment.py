@@ -26,9 +26,8 @@ def experiment(*, ablations: str | None = None, **settings: Any) -> int:
 
     config = Config(**{name: value for name, value in settings.items() if name != "config"})
     if config.first_order != "none" and config.model.encoder.width == 0:
-        raise ValueError(
-            f"gradient.objective: expected none in an experiment without model.encoder, which fits in stages, got {config.first_order}"
-        )
+        got = config.first_order
+        raise ValueError(f"gradient.objective: expected none in an experiment without model.encoder (it fits in stages), got {got}")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if ablations is not None:
         tables = run_ablations(config, read_variants(Path(ablations), config))

@@ -131,8 +131,9 @@ def fit_encoded(joint: JointScanCRF, pairs: Sequence[ScanPair], material: Sequen
         raise ValueError("gradient.objective: expected one for a model with an encoder, got none")
     model = JointScanCRF(config.model)
     load_weights(model, config.init or joint)
+    alone = replace(config, gradient=replace(config.gradient, workers=0))  # a fold's process starts no others; same pairs
     with TemporaryDirectory() as folder:
-        train_by_gradient(model, config, pairs, (), Store(Path(folder), {}), ALONE)
+        train_by_gradient(model, alone, pairs, (), Store(Path(folder), {}), ALONE)
     model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
     return model
 
