@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
+from torch.overrides import TorchFunctionMode
 
 from torchcrf_scan.batch import ScanPairBatch, scale_motions
 from torchcrf_scan.config import ModelConfig
@@ -31,7 +32,6 @@ FROM_BATCH = (
     *("source", "target", "source_mask", "target_mask", "source_closed", "target_closed"),
     *("range_noise", "initial_motion", "target_origin"),
 )
-OF_TARGET = ("target", "target_mask", "target_tangents")  # inputs whose second axis counts target points
 OUTPUTS = (
     *("association", "cluster", "motions", "active", "candidates", "log_association", "log_cluster"),
     *("association_confidence", "cluster_confidence"),
@@ -44,10 +44,12 @@ class UnrolledDecoder(nn.Module):
     Args:
         model: its weights are shared; it decodes on tensors (backend `eager`) and does not stop early.
         iterations: rounds; None: the model's.
+        plain: with `PlainOperators`, for other runtimes.
     """
 
-    def __init__(self, model: JointScanCRF, iterations: int | None = None) -> None:
+    def __init__(self, model: JointScanCRF, iterations: int | None = None, *, plain: bool = False) -> None:
         super().__init__()
+        self.plain = plain
         self.model = copy.copy(model)
         self.model.config = unrolled_config(model.config, iterations)
 
@@ -62,18 +64,18 @@ class UnrolledDecoder(nn.Module):
         range_noise: Tensor,
         initial_motion: Tensor,
         target_origin: Tensor,
-        motions: Tensor,
-        active: Tensor,
-        association: Tensor | None = None,
-        target_tangents: Tensor | None = None,
-        reach: Tensor | None = None,
-        log_odds: Tensor | None = None,
+        start_motions: Tensor,
+        start_active: Tensor,
+        start_association: Tensor | None = None,
+        start_target_tangents: Tensor | None = None,
+        start_reach: Tensor | None = None,
+        start_log_odds: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """The fields `OUTPUTS` of a `Prediction`.
 
         The first nine inputs are those of a `ScanPairBatch`, the others those of a `Start`: motions (B, C, 3) and which of them
-        exist, active (B, C), and where InitialiseRT found them, all that it says. Without association and target_tangents these
-        follow from the motions (`Start.at`).
+        exist (B, C), and where InitialiseRT found them, all that it says. Without association and tangents these follow from the
+        motions (`Start.at`).
         """
         batch = ScanPairBatch(
             source=source,
@@ -87,14 +89,18 @@ class UnrolledDecoder(nn.Module):
             initial_motion=initial_motion,
             target_origin=target_origin,
         )
-        if association is None or target_tangents is None:
-            start = Start.at(batch, motions, active)
+        if start_association is None or start_target_tangents is None:
+            start = Start.at(batch, start_motions, start_active)
         else:
-            start = Start(motions, active, association, target_tangents)
-        view = self.model.view(batch)
-        start = replace(start, reach=reach, log_odds=log_odds).scaled(view.factor)
+            start = Start(start_motions, start_active, start_association, start_target_tangents)
+        start = replace(start, reach=start_reach, log_odds=start_log_odds)
+        with PlainOperators() if self.plain else nullcontext():
+            return self._answers(batch, start)
+
+    def _answers(self, batch: ScanPairBatch, start: Start) -> dict[str, Tensor]:
+        view = self.model.view(batch, self.model.learned_inputs(batch, start))
         fitted = self.model.fitted
-        state = joint.settle(view, start, fitted, self.model.config).state
+        state = joint.settle(view, start.scaled(view.factor), fitted, self.model.config).state
         association_confidence, cluster_confidence = fitted.calibration(state)
         return {
             "association": state.association,
@@ -126,7 +132,10 @@ def decoder_inputs(batch: ScanPairBatch, start: Start | Tensor) -> dict[str, Ten
         of_start = {"motions": start, "active": torch.ones_like(start[..., 0], dtype=torch.bool)}
     else:
         of_start = {f.name: getattr(start, f.name) for f in fields(start) if getattr(start, f.name) is not None}
-    return {name: getattr(batch, name) for name in FROM_BATCH} | of_start
+    of_batch = {name: getattr(batch, name) for name in FROM_BATCH}
+    return of_batch | {
+        f"start_{name}": value for name, value in of_start.items()
+    }  # a graph's names are one space: motions go out too
 
 
 def export_program(
@@ -139,8 +148,9 @@ def export_program(
     inputs = {name: value if len(value) > 1 else torch.cat([value, value]) for name, value in decoder_inputs(batch, start).items()}
     pairs = Dim("pairs")
     shapes = {name: {0: pairs} for name in inputs}
+    decoder = UnrolledDecoder(model, iterations, plain=True)
     with torch.no_grad():
-        return torch.export.export(UnrolledDecoder(model, iterations), (), inputs, dynamic_shapes=shapes, strict=False)
+        return torch.export.export(decoder, (), inputs, dynamic_shapes=shapes, strict=False)
 
 
 def export_onnx(path: str | Path, program: ExportedProgram) -> None:
@@ -150,42 +160,45 @@ def export_onnx(path: str | Path, program: ExportedProgram) -> None:
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    small = program.run_decompositions(onnx_decompositions())
-    written = torch.onnx.export(small, opset_version=OPSET, output_names=list(OUTPUTS), dynamo=True, verbose=False)
+    names = list(OUTPUTS)
+    # not simplified here, which takes minutes: a runtime does it in a second when it loads the file
+    written = torch.onnx.export(program, opset_version=OPSET, output_names=names, dynamo=True, optimize=False, verbose=False)
     assert written is not None
     written.save(temporary)
     os.replace(temporary, path)
 
 
-def onnx_decompositions() -> dict[Any, Callable[..., Any]]:
-    """The usual decompositions, and what ONNX has no operator for in terms of what it has."""
-    own = {
-        torch.ops.aten.searchsorted.Tensor: count_below,
-        torch.ops.aten.nanmedian.dim: middle_of_known,
-        torch.ops.aten._linalg_solve_ex.default: eliminate,
-    }
-    return {**torch.export.default_decompositions(), **own}
+class PlainOperators(TorchFunctionMode):
+    """Within it, what ONNX has no operator for is computed by operators that it has, and gradients that are off stay off silently:
+    every switch would be a program in the program, which takes a fifth of the time of an export.
+    """
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """The function itself, or its counterpart."""
+        if func is torch._C._set_grad_enabled and args[0] == torch.is_grad_enabled():
+            return None
+        own = {torch.searchsorted: count_below, Tensor.nanmedian: middle_of_known, torch.linalg.solve_ex: eliminate}
+        return own.get(func, func)(*args, **(kwargs or {}))
 
 
-def count_below(sorted_sequence: Tensor, values: Tensor, **_: Any) -> Tensor:
+def count_below(sorted_sequence: Tensor, values: Tensor) -> Tensor:
     """`torch.searchsorted` from the left, every value against every entry. sorted_sequence: (R, M); values: (R, P)."""
     return (sorted_sequence[:, None] < values[..., None]).sum(-1)
 
 
-def middle_of_known(values: Tensor, dim: int, keepdim: bool = False) -> tuple[Tensor, Tensor]:
-    """`torch.nanmedian`, the lower of two middle ones, and its index; NaN where all are."""
+def middle_of_known(values: Tensor, dim: int) -> torch.return_types.nanmedian:
+    """`torch.nanmedian`: the lower of two middle ones, and its index; NaN where all are."""
     ordered, index = values.masked_fill(values.isnan(), torch.inf).sort(dim)
     known = (~values.isnan()).sum(dim, keepdim=True)
     place = (known - 1).clamp(min=0) // 2
     middle = torch.where(known > 0, ordered.gather(dim, place), torch.nan)
-    found = middle, index.gather(dim, place)
-    return found if keepdim else (found[0].squeeze(dim), found[1].squeeze(dim))
+    return torch.return_types.nanmedian((middle.squeeze(dim), index.gather(dim, place).squeeze(dim)))
 
 
-def eliminate(matrix: Tensor, right: Tensor, **_: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """`torch.linalg.solve_ex` of positive definite systems of one right side by elimination without a pivot.
+def eliminate(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
+    """`torch.linalg.solve_ex` of positive definite systems of one right side by elimination without a pivot: nothing can fail.
 
-    matrix: (..., n, n); right: (..., n). Beside the solution there are factors, pivots and info, which nobody reads.
+    matrix: (..., n, n); right: (..., n). Returns (..., n) and (...) zeros.
     """
     n = right.shape[-1]
     rows = [[*matrix[..., i, :].unbind(-1), right[..., i]] for i in range(n)]
@@ -197,5 +210,4 @@ def eliminate(matrix: Tensor, right: Tensor, **_: Any) -> tuple[Tensor, Tensor, 
     for i in reversed(range(n)):
         rest = sum((a * x for a, x in zip(rows[i][n - 1 : i : -1], solution, strict=True)), start=torch.zeros_like(rows[i][n]))
         solution.append((rows[i][n] - rest) / rows[i][i])
-    unread = torch.zeros_like(right, dtype=torch.int32)
-    return torch.stack(solution[::-1], dim=-1), matrix.clone(), unread, unread[..., 0].clone()
+    return torch.stack(solution[::-1], dim=-1), torch.zeros_like(right[..., 0], dtype=torch.int32)

@@ -12,8 +12,10 @@ from torchcrf_scan.backend import is_numba_installed
 from torchcrf_scan.config import Config, EncoderConfig, FeatureConfig, GradientConfig, LearningConfig, ModelConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.encoder.encoder import ScanEncoder, unroll
+from torchcrf_scan.export import UnrolledDecoder, decoder_inputs
 from torchcrf_scan.features.learned import ExtraLogUnary
 from torchcrf_scan.learning.checkpoint import load_weights
+from torchcrf_scan.learning.methods import with_config
 from torchcrf_scan.learning.objectives import make_objective
 from torchcrf_scan.learning.portions import as_portion
 from torchcrf_scan.scan import ScanPair
@@ -129,6 +131,18 @@ def test_it_is_saved_with_the_model(batch: ScanPairBatch, tmp_path: Path) -> Non
     model.save_pretrained(tmp_path)
     with torch.no_grad():
         assert torch.equal(JointScanCRF.from_pretrained(tmp_path)(batch).log_cluster, model(batch).log_cluster)
+
+
+@torch.no_grad()
+def test_it_is_part_of_the_program_for_other_runtimes(batch: ScanPairBatch) -> None:
+    model = loud(with_encoder(backend="eager"))
+    start = model.initialise(batch)
+    answers = UnrolledDecoder(model, 1)(**decoder_inputs(batch, start))
+    inference = replace(model.config.inference, stop_early=False, iterations=1)
+    expected = with_config(model, replace(model.config, inference=inference))(batch, start)
+    assert_close(answers["log_cluster"], expected.log_cluster)
+    quiet = UnrolledDecoder(with_encoder(backend="eager"), 1)(**decoder_inputs(batch, start))
+    assert not torch.allclose(answers["log_cluster"], quiet["log_cluster"])
 
 
 def test_what_cannot_be() -> None:
