@@ -22,7 +22,7 @@ from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import Scores, Table, differences_table, report
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.learning.cross_validation import Results, cores, file_name, make_folds, rank_and_world, read_folds, run_folds
-from torchcrf_scan.learning.methods import EXACT, JOINT, Study
+from torchcrf_scan.learning.methods import ENCODED, EXACT, JOINT, Study
 from torchcrf_scan.scan import Ints, PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_associations, plot_clusters, save_figure
 from torchcrf_scan.viz.tensorboard import RunLog
@@ -191,7 +191,7 @@ def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: s
     """Overview, Tables I to III, how sure and the differences of one protocol, logged as well."""
     tables = report(scores, seconds=seconds, published=True)
     weights = resample(scores[JOINT], config)
-    tables += [differences_table(name, scores, weights) for name in (JOINT, EXACT) if name in scores and len(scores) > 1]
+    tables += [differences_table(name, scores, weights) for name in (JOINT, ENCODED, EXACT) if name in scores and len(scores) > 1]
     tables = [replace(table, title=f"{table.title} ({protocol.replace('_', ' ')})") for table in tables]
     for table in tables:
         run.table(table)
