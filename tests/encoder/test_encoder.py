@@ -179,3 +179,19 @@ def test_it_learns_with_the_weights(pairs: list[ScanPair]) -> None:
     assert model.encoder is not None
     assert bool((model.encoder.last.weight[:2] != 0).any())
     assert isinstance(model.encoder, ScanEncoder)
+
+
+# --- the shipped one ----------------------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def test_the_shipped_one_tells_more_outliers(batch: ScanPairBatch, pairs: list[ScanPair]) -> None:
+    encoded, plain = JointScanCRF.from_pretrained("encoder"), JointScanCRF.from_pretrained()
+    assert encoded.encoder is not None
+    assert plain.encoder is None
+    assert batch.truth is not None
+    said = encoded.encoder(batch, encoded.initialise(batch)).extra.outlier
+    assert said is not None
+    known, is_outlier = batch.truth.known, batch.truth.association < 0
+    outlier, inlier = said[known & is_outlier], said[known & ~is_outlier]
+    assert outlier.mean() > inlier.mean() + 0.5
