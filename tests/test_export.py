@@ -120,7 +120,8 @@ class Half(torch.nn.Module):
 def test_a_program_of_dataclasses_is_saved_and_loaded(cases: list[tuple[ScanPairBatch, Start]], tmp_path: Path) -> None:
     start = cases[0][1]
     torch.export.save(torch.export.export(Half(), (start,)), tmp_path / "half.pt2")
-    found = torch.export.load(tmp_path / "half.pt2").module()(start)
+    with torch.serialization.safe_globals([Start]):  # the file holds the example, and torch loads no class that nobody vouches for
+        found = torch.export.load(tmp_path / "half.pt2").module()(start)
     assert torch.equal(found.motions, Half()(start).motions)
     assert torch.equal(found.association, start.association)
 
@@ -157,13 +158,18 @@ def test_onnxruntime_answers_as_the_model(
     assert {entry.domain: entry.version for entry in onnx.load(tmp_path / "model.onnx").opset_import}[""] == OPSET
     session = runtime.InferenceSession(tmp_path / "model.onnx")
     names = [given.name for given in session.get_inputs()]
-    assert {"start_motions", "source"} <= {*names} < {*decoder_inputs(*cases[0])}  # movers are decided: nobody asks for their odds
+    assert names == [*decoder_inputs(*cases[0])]
     assert tuple(out.name for out in session.get_outputs()) == OUTPUTS
     for batch, start in cases:
         inputs = decoder_inputs(batch, start)
         values = session.run(None, {name: inputs[name].numpy() for name in names})
+        found = dict(zip(OUTPUTS, map(torch.from_numpy, values), strict=True))
         with torch.no_grad():
-            assert_same(dict(zip(OUTPUTS, map(torch.from_numpy, values), strict=True)), decided(batch, start), 1e-4)
+            expected = decided(batch, start)
+        is_possible = batch.source_mask[..., None] & (expected.log_association[..., :-1] > -torch.inf)
+        # where a scan has fewer points than candidates, those that do not exist are equally far, and every runtime names others
+        found["candidates"] = torch.where(is_possible, found["candidates"], expected.candidates)
+        assert_same(found, expected, 1e-4)
 
 
 def test_what_cannot_be_exported_says_so(model: JointScanCRF) -> None:

@@ -156,7 +156,7 @@ def export_program(
 def export_onnx(path: str | Path, program: ExportedProgram) -> None:
     """Writes what `export_program` made as an ONNX file of opset `OPSET`, whole or not at all; needs the extra `export`.
 
-    Inputs are `decoder_inputs` (without those that the model does not ask for), outputs `OUTPUTS`.
+    Inputs are `decoder_inputs`, outputs `OUTPUTS`; candidates that are impossible may be others than the model's.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
