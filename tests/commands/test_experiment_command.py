@@ -1,6 +1,8 @@
 """`experiment`: the whole of it on four small pairs, and ablations."""
 
+import contextlib
 import csv
+import io
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -37,12 +39,10 @@ def draw_once(patch: pytest.MonkeyPatch, at_first: int = 1) -> None:
 def done(pairs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The run folder of the whole experiment, and what was printed."""
     folder = tmp_path_factory.mktemp("experiment") / "run"
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
         draw_once(patch)
-        printed: list[str] = []
-        patch.setattr("builtins.print", lambda *values, **_: printed.extend(map(str, values)))
         assert run("experiment", "--experiment.pairs", pairs_dir, "--output", folder, *SMALL) == 0
-    return folder, "\n".join(printed)
+    return folder, printed.getvalue()
 
 
 def test_every_method_is_in_every_table(done: tuple[Path, str]) -> None:
