@@ -48,7 +48,8 @@ class JointScanCRF(nn.Module):
     Eq. 6 on hard labels whatever `motion_metric` and `motion_weights` say.
 
     With `features.embedding` there are two weights more in `association_weights`, `embedding` and `embedding_data` (see
-    `features.learned`), and with `features.learn_stumps` the boosters are parameters.
+    `features.learned`), and with `features.learn_stumps` the boosters are parameters. With `encoder` there is a `ScanEncoder`,
+    asked once, under the motions of the start; what it says is added to what `forward` is given.
     """
 
     association_weights: nn.ParameterDict

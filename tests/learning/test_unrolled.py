@@ -485,3 +485,4 @@ def test_the_loss_never_looks_at_a_value(movers: str, coupling: str) -> None:
     with no_looking_at_values():
         loss = unrolled_loss(model, batch, UnrolledConfig(deep_supervision=0.5), replace(start, log_odds=odds))["total"]
     loss.backward()
+    assert loss.isfinite()
