@@ -21,8 +21,8 @@ from pathlib import Path
 
 from jsonargparse import ArgumentParser
 
-from torchcrf_scan.config import Config
 from torchcrf_scan.evaluation.report import report
+from torchcrf_scan.learning.settings import Config
 from torchcrf_scan.learning.trainer import train
 
 

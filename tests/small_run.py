@@ -13,20 +13,14 @@ from pathlib import Path
 
 import torch
 
-from torchcrf_scan.config import (
-    Config,
-    FeatureConfig,
-    GradientConfig,
-    InferenceConfig,
-    ModelConfig,
-    SimulatorConfig,
-    UnrolledConfig,
-)
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning import checkpoint
 from torchcrf_scan.learning.checkpoint import Store
 from torchcrf_scan.learning.gradient import Learner, Report, train_by_gradient
 from torchcrf_scan.learning.ranks import ALONE, Ranks, join
+from torchcrf_scan.learning.settings import Config, GradientConfig, UnrolledConfig
 from torchcrf_scan.learning.trainer import settings_of
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair

@@ -5,8 +5,8 @@ import torch
 from support import assert_close
 
 from torchcrf_scan import JointScanCRF, ScanPairBatch
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 
 
 @pytest.fixture(scope="module")

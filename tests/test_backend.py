@@ -8,12 +8,14 @@ import pytest
 import torch
 
 from torchcrf_scan import JointScanCRF, Scan, ScanPair, ScanPairBatch
-from torchcrf_scan.backend import can_decode, can_search, is_numba_installed
-from torchcrf_scan.batch import Prediction
-from torchcrf_scan.config import InferenceConfig, LearningConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.fast.choice import can_decode, can_search, is_numba_installed
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.learning.material import collect
+from torchcrf_scan.learning.settings import LearningConfig
+from torchcrf_scan.prediction import Prediction
 
 needs_numba = pytest.mark.skipif(not is_numba_installed(), reason="needs numba, the extra fast")
 POINTS = torch.zeros(1, 3, 2)
@@ -159,7 +161,7 @@ def test_what_is_not_compiled_is_said(config: ModelConfig, reason: str) -> None:
 
 
 def test_without_numba_tensors_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchcrf_scan.backend.is_numba_installed", lambda: False)
+    monkeypatch.setattr("torchcrf_scan.fast.choice.is_numba_installed", lambda: False)
     assert not can_search("auto", POINTS)
     assert not can_decode(ModelConfig(), POINTS, needs_gradient=False)
     with pytest.raises(ValueError, match="backend: expected for compiled numba"):

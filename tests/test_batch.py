@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import assert_close
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.uncertainty import Uncertainty
+from torchcrf_scan.prediction import Prediction, Uncertainty
 from torchcrf_scan.scan import Annotation, Scan, ScanPair
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import fail, run
+from torchcrf_scan.benchmark.stages import STAGES, TABLES, calls_per_pair
 
 from torchcrf_scan.benchmark import limits, rivals
 from torchcrf_scan.benchmark.backends import installed_backends, with_backend
@@ -17,7 +18,6 @@ from torchcrf_scan.benchmark.machine import Rates
 from torchcrf_scan.benchmark.plan import Plan, settings_of
 from torchcrf_scan.benchmark.report import EVERYWHERE, report_tables, write_report
 from torchcrf_scan.benchmark.scenes import ODOMETRY_SHIFT, ODOMETRY_TURN, in_mode, street_pairs
-from torchcrf_scan.benchmark.stages import STAGES, TABLES, calls_per_pair
 from torchcrf_scan.benchmark.study import growth_rows
 from torchcrf_scan.benchmark.timing import Task, Timed, time_in_turns
 from torchcrf_scan.model import JointScanCRF

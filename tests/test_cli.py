@@ -11,7 +11,7 @@ from command_line import run
 import torchcrf_scan
 from torchcrf_scan import cli
 from torchcrf_scan.commands.evaluate import METHODS
-from torchcrf_scan.config import SimulatorConfig
+from torchcrf_scan.data.worlds import SimulatorConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 

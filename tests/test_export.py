@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.export import ExportedProgram
 
 from torchcrf_scan import InferenceConfig, JointScanCRF, ModelConfig, ScanPair, ScanPairBatch
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.export import (
     OPSET,
     OUTPUTS,
@@ -24,7 +24,7 @@ from torchcrf_scan.export import (
     export_program,
     middle_of_known,
 )
-from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.scan import Scan
 
 BEAMS = 31

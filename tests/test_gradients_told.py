@@ -10,11 +10,11 @@ from support import assert_close
 from torch import Tensor
 
 from torchcrf_scan import ExtraLogUnary, JointScanCRF, ScanPairBatch
-from torchcrf_scan.batch import Prediction
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.inference.messages import chain_beliefs
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import PairPrediction
 
 LABELS = ("association", "cluster", "active", "candidates", "converged", "iterations")

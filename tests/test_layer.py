@@ -12,12 +12,13 @@ from support import assert_close, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan import ClusteringCRF, ExtraLogUnary, FeatureConfig, InferenceConfig, JointScanCRF, MatchingCRF, ModelConfig
-from torchcrf_scan.backend import is_numba_installed
-from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.fast.choice import is_numba_installed
 from torchcrf_scan.features.learned import Embeddings
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.selection import evidence
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.prediction import Prediction
 
 N, M, SIZE = 12, 10, 3
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3]], dtype=torch.float64)

@@ -6,10 +6,11 @@ are bool, True = real; logarithms are named `log_*`. Frame: x ahead, y left, met
 (theta, tx, ty) maps points of the first scan (source) into the frame of the second (target).
 """
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.features.learned import ExtraLogUnary
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
+from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
 
 __version__ = "0.1.0"

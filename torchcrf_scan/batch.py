@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.scan import Floats, PairPrediction, Scan, ScanPair
+from torchcrf_scan.scan import Floats, Scan, ScanPair
 from torchcrf_scan.tree import tensor_tree
 
 if TYPE_CHECKING:
-    from torchcrf_scan.inference.uncertainty import Uncertainty
+    pass
 
 
 @tensor_tree
@@ -152,8 +151,8 @@ class ScanPairBatch:
             source_closed=torch.tensor([pair.source.is_closed for pair in pairs]),
             target_closed=torch.tensor([pair.target.is_closed for pair in pairs]),
             dt=torch.tensor([pair.dt for pair in pairs], dtype=dtype),
-            range_noise=torch.tensor([_range_noise(pair) for pair in pairs], dtype=dtype),
-            initial_motion=torch.from_numpy(np.stack([_initial_motion(pair) for pair in pairs])).to(dtype),
+            range_noise=torch.tensor([range_noise_of(pair) for pair in pairs], dtype=dtype),
+            initial_motion=torch.from_numpy(np.stack([initial_motion_of(pair) for pair in pairs])).to(dtype),
             target_origin=torch.zeros(len(pairs), 2, dtype=dtype),
             truth=_collate_truth(pairs, source_mask, dtype) if all(pair.annotation for pair in pairs) else None,
         )
@@ -175,7 +174,7 @@ def _pad_points(scans: Sequence[Scan]) -> tuple[Tensor, Tensor]:
     return points, torch.arange(longest) < lengths[:, None]
 
 
-def _initial_motion(pair: ScanPair) -> Floats:
+def initial_motion_of(pair: ScanPair) -> Floats:
     """(3,) the guess, the identity where there is none."""
     if pair.initial_motion is None:
         return np.zeros(3)
@@ -185,7 +184,7 @@ def _initial_motion(pair: ScanPair) -> Floats:
     return guess
 
 
-def _range_noise(pair: ScanPair) -> float:
+def range_noise_of(pair: ScanPair) -> float:
     """What the sensor says, else an estimate: on smooth surfaces the ranges' second difference is noise alone."""
     stated = [scan.range_noise for scan in (pair.source, pair.target) if scan.range_noise is not None]
     if stated:
@@ -213,75 +212,3 @@ def _collate_truth(pairs: Sequence[ScanPair], source_mask: Tensor, dtype: torch.
     return Truth(
         torch.from_numpy(association), torch.from_numpy(cluster), torch.from_numpy(motions).to(dtype), torch.from_numpy(known)
     )
-
-
-@tensor_tree
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """What the model says of a batch; tensors of points, batch first. The README tells what every output's gradient is and costs.
-
-    Whole numbers and booleans have no gradient, and nothing has where compiled code answered or by the `flooding` schedule.
-
-    Attributes:
-        association: (B, N) int64 target point, -1 outlier.
-        cluster: (B, N) int64 0 background, 1..D-2 movers, -1 outlier.
-        motions: (B, D-1, 3) `T_target_source` of background and movers. Gradients reach what was learned only if
-            `motion_weights` is soft; with hard ones they reach the points alone and, point-to-line, the start's motions.
-        active: (B, D-1) bool, the clusters that exist. The others' motions are those of the start or of their last points.
-        candidates: (B, N, K) int64 target point that every inlier association state stands for.
-        log_association: (B, N, K+1) normalised log-beliefs of the association chain, last = outlier; uniform in the padding.
-            Differentiable at the candidates that there are; kinks where labellings tie, but only at temperature 0.
-        log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier; likewise.
-        converged: (B,) bool, whether labels and motions had settled.
-        iterations: (B,) int64 rounds done.
-        association_confidence: (B, N) in [0, 1], to be right within two target points; calibrated. None: the beliefs themselves.
-            Gradient of the beliefs, at the label as it is.
-        cluster_confidence: (B, N) in [0, 1], calibrated. None: the beliefs themselves. Gradient likewise.
-        uncertainty: covariances of the motions and what of them was not observed; None for methods that do not say. Of these only
-            the covariances have a gradient.
-    """
-
-    association: Tensor
-    cluster: Tensor
-    motions: Tensor
-    active: Tensor
-    candidates: Tensor
-    log_association: Tensor
-    log_cluster: Tensor
-    converged: Tensor
-    iterations: Tensor
-    association_confidence: Tensor | None = None
-    cluster_confidence: Tensor | None = None
-    uncertainty: Uncertainty | None = None
-
-    def pair(self, b: int, pair: ScanPair) -> PairPrediction:
-        """Pair b by beam, its movers numbered 1.. by falling size, the vacuous ones left out."""
-        n = len(pair.source)
-        association, cluster = self.association[b, :n].cpu().numpy(), self.cluster[b, :n].cpu().numpy()
-        motions = self.motions[b].detach().cpu().double().numpy()
-        sizes = np.bincount(cluster[cluster > 0], minlength=len(motions))
-        movers = [k for k in np.argsort(-sizes, kind="stable") if k > 0 and sizes[k] > 0]
-        number = np.full(len(motions) + 1, -1)  # the last entry keeps -1 at -1
-        number[[0, *movers]] = np.arange(len(movers) + 1)
-        beam_of_point = np.append(pair.target.beam, -1)
-        rows = [0, *movers]
-        given = (self.association_confidence, self.log_association), (self.cluster_confidence, self.log_cluster)
-        confidences = [(log.exp().amax(-1) if sure is None else sure)[b, :n].detach().cpu().double().numpy() for sure, log in given]
-
-        def of_clusters(values: Tensor) -> NDArray[Any]:
-            return values[b].detach().cpu().numpy()[rows]
-
-        certainty = {}
-        if self.uncertainty is not None:
-            certainty["covariances"] = of_clusters(self.uncertainty.covariance.double())
-            certainty["unobserved_turn"] = of_clusters(self.uncertainty.is_turn_unobserved)
-            certainty["unobserved_shift"] = of_clusters(self.uncertainty.unobserved_shift.double())
-        return PairPrediction(
-            association=pair.source.to_beams(beam_of_point[association], -1),
-            cluster=pair.source.to_beams(number[cluster], -1),
-            motions=motions[rows],
-            association_confidence=pair.source.to_beams(confidences[0], 0.0),
-            cluster_confidence=pair.source.to_beams(confidences[1], 0.0),
-            converged=bool(self.converged[b]),
-            **certainty,
-        )

@@ -24,7 +24,7 @@ from torch.overrides import TorchFunctionMode
 from torchcrf_scan.batch import ScanPairBatch, scale_motions
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import JointScanCRF
 
 OPSET = 18  # of ONNX

@@ -6,7 +6,6 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +13,30 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchcrf_scan.backend import can_decode, can_search
-from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
-from torchcrf_scan.config import EncoderConfig, FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.batch import ScanPairBatch, scale_motions
+from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.encoder.encoder import ScanEncoder
+from torchcrf_scan.fast.choice import can_decode
+from torchcrf_scan.fast.decode import learned_of, settings_of
+from torchcrf_scan.fast.pairs import by_beam, decode_pairs, extras_of, predict
 from torchcrf_scan.features.learned import EMBEDDING_WEIGHTS, Embeddings, ExtraLogUnary, LearnedInputs
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales, has_weight, live_weights
-from torchcrf_scan.inference import flooding, joint, lattice_likelihood, pseudo_likelihood
-from torchcrf_scan.inference.initialise import Start, initialise
-from torchcrf_scan.inference.joint import Parameters
-from torchcrf_scan.inference.movers import HypothesisScore
-from torchcrf_scan.inference.paper_start import paper_start
-from torchcrf_scan.inference.points_start import points_start
+from torchcrf_scan.inference import joint, pseudo_likelihood
 from torchcrf_scan.inference.selection import ClusterPotential
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.inference.uncertainty import Calibration
+from torchcrf_scan.loops.pair import pair_of_scans
+from torchcrf_scan.prediction import Prediction
+from torchcrf_scan.pretrained import PRETRAINED, find_weights, model_config
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
-
-PRETRAINED = "simulated"
+from torchcrf_scan.search.accept import score_of
+from torchcrf_scan.search.pairs import initialise, start_pairs
+from torchcrf_scan.search.score import HypothesisScore
+from torchcrf_scan.variants import flooding, lattice_likelihood
+from torchcrf_scan.variants.paper_start import paper_start
+from torchcrf_scan.variants.points_start import points_start
 
 
 class JointScanCRF(nn.Module):
@@ -162,25 +167,18 @@ class JointScanCRF(nn.Module):
 
     def initialise(self, batch: ScanPairBatch) -> Start:
         """InitialiseRT: the motions to begin with (Algorithm 1, line 1). No gradient."""
-        clusters = self.config.inference.clusters - 1
-        if self.config.chains == "matching":
-            clusters = 1
-        with torch.autocast(batch.source.device.type, enabled=False):  # a few centimetres decide which movers there are
-            return self._search(batch, clusters)
-
-    def _search(self, batch: ScanPairBatch, clusters: int) -> Start:
-        """The start of `initialise` with that many motions, in full precision."""
-        if can_search(self.config.inference.backend, batch.source):
-            from torchcrf_scan.compiled import movers, pair
-
-            found = pair.initialise(batch, movers.score_of(self.hypothesis_score), clusters)
-        else:
-            found = initialise(batch, self.hypothesis_score, clusters)
+        found = initialise(batch, score_of(self.hypothesis_score), self._clusters)
         if self.config.start == "search":
             return found
-        view = self.view(batch)
         look = {"paper": paper_start, "points": points_start}[self.config.start]
-        return look(view, found.scaled(view.factor), self.fitted, self.config.inference).scaled(1 / view.factor)
+        with torch.autocast(batch.source.device.type, enabled=False):  # a few centimetres decide which movers there are
+            view = self.view(batch)
+            return look(view, found.scaled(view.factor), self.fitted, self.config.inference).scaled(1 / view.factor)
+
+    @property
+    def _clusters(self) -> int:
+        """C: motions of background and movers."""
+        return 1 if self.config.chains == "matching" else self.config.inference.clusters - 1
 
     def forward(
         self,
@@ -200,37 +198,30 @@ class JointScanCRF(nn.Module):
                 ones are associated. The start is looked for without them. None: as if the model knew none.
             extra_log_unary: (B, N) learned log potentials of outliers and of moving points.
         """
-        if self.encoder is not None:
-            start = start or self.initialise(batch)
+        start = start or self.initialise(batch)
         learned = self.learned_inputs(
             batch, start, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
         )
-        if self._is_compiled(batch, learned):
-            return self._predict_compiled(batch, start, learned)
-        start = start or self.initialise(batch)
+        decode = self._in_loops if self._needs_no_tensors(batch, learned) else self._in_tensors
+        return decode(batch, start, learned)
+
+    def _needs_no_tensors(self, batch: ScanPairBatch, learned: LearnedInputs | None) -> bool:
+        """Whether the loops answer: on a CPU, for settings that they know, where there is no gradient to follow."""
+        extra = () if learned is None else (learned.outlier, learned.moving)
+        tensors = (*self.parameters(), batch.source, batch.target, batch.initial_motion, *extra)
+        needs_gradient = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
+        has_embeddings = learned is not None and learned.embeddings is not None
+        return can_decode(self.config, batch.source.device, needs_gradient=needs_gradient, has_embeddings=has_embeddings)
+
+    def _in_loops(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
+        return predict(batch, start, learned_of(self.fitted), settings_of(self.config), learned)
+
+    def _in_tensors(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
         view = self.view(batch, learned)
         schedule = {"sweep": joint.decode, "flooding": flooding.decode}[self.config.inference.schedule]
         prediction = schedule(view, start.scaled(view.factor), self.fitted, self.config)
         uncertainty = prediction.uncertainty and prediction.uncertainty.scaled(1 / view.factor)
         return replace(prediction, motions=scale_motions(prediction.motions, 1 / view.factor), uncertainty=uncertainty)
-
-    def _is_compiled(self, batch: ScanPairBatch, learned: LearnedInputs | None) -> bool:
-        """Whether compiled code answers: there is no gradient to follow, and no scan is empty, which is left to tensors."""
-        extra = () if learned is None else (learned.outlier, learned.moving)
-        tensors = (*self.parameters(), batch.source, batch.target, batch.initial_motion, *extra)
-        needs_gradient = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
-        has_embeddings = learned is not None and learned.embeddings is not None
-        is_possible = can_decode(self.config, batch.source, needs_gradient=needs_gradient, has_embeddings=has_embeddings)
-        return is_possible and bool(batch.source_mask[:, :1].all() and batch.target_mask[:, :1].all())
-
-    def _predict_compiled(self, batch: ScanPairBatch, start: Start | None, learned_inputs: LearnedInputs | None) -> Prediction:
-        from torchcrf_scan.compiled import decode, movers, pair
-
-        if start is None and self.config.start != "search":
-            start = self.initialise(batch)
-        score, learned = movers.score_of(self.hypothesis_score), decode.learned_of(self.fitted)
-        settings, states = decode.settings_of(self.config), self.config.inference.clusters
-        return pair.predict(batch, start, score, learned, settings, states, learned_inputs)
 
     def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
         """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.
@@ -262,14 +253,25 @@ class JointScanCRF(nn.Module):
     @torch.no_grad()
     def match_pairs(self, pairs: Sequence[ScanPair], batch_size: int = 16) -> list[PairPrediction]:
         """Many pairs, in batches."""
-        reference = self.association_weights["sequence"]
-        found = []
+        found: list[PairPrediction] = []
         for begin in range(0, len(pairs), batch_size):
-            part = pairs[begin : begin + batch_size]
-            batch = ScanPairBatch.collate(part, reference.dtype).without_truth().to(reference.device)
-            prediction = self(batch)
-            found += [prediction.pair(b, pair) for b, pair in enumerate(part)]
+            found += self._match(pairs[begin : begin + batch_size])
         return found
+
+    def _match(self, pairs: Sequence[ScanPair]) -> list[PairPrediction]:
+        """The answers for one batch of pairs: in arrays all the way where the loops answer, in padded tensors elsewhere."""
+        reference = self.association_weights["sequence"]
+        has_embeddings = self.config.encoder.embedding > 0
+        if self.config.start != "search" or not can_decode(self.config, reference.device, has_embeddings=has_embeddings):
+            prediction = self(ScanPairBatch.collate(pairs, reference.dtype).without_truth().to(reference.device))
+            return [prediction.pair(b, pair) for b, pair in enumerate(pairs)]
+        scans = [pair_of_scans(pair, reference.dtype) for pair in pairs]
+        starts = start_pairs(scans, score_of(self.hypothesis_score), self._clusters)
+        extras = extras_of(
+            [len(pair.source) for pair in scans], None if self.encoder is None else self.encoder.of_pairs(scans, starts)
+        )
+        answers = decode_pairs(scans, starts, extras, learned_of(self.fitted), settings_of(self.config))
+        return [by_beam(answer, pair) for answer, pair in zip(answers, pairs, strict=True)]
 
     def save_pretrained(self, folder: str | Path) -> None:
         """Writes `config.json` and `model.safetensors` into a folder, each whole or not at all."""
@@ -329,32 +331,3 @@ class ClusteringCRF(JointScanCRF):
 
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__(replace(config or ModelConfig(), chains="clustering", coupling="motions"))
-
-
-def model_config(values: dict[str, Any]) -> ModelConfig:
-    """The config that `asdict` made into a dictionary."""
-    return ModelConfig(
-        **{k: v for k, v in values.items() if k not in ("features", "inference", "encoder")},
-        features=FeatureConfig(**{**values["features"], "left_out": tuple(values["features"].get("left_out", ()))}),
-        inference=InferenceConfig(**values["inference"]),
-        encoder=encoder_config(values.get("encoder", {})),
-    )
-
-
-def encoder_config(values: dict[str, Any]) -> EncoderConfig:
-    """The config that `asdict` made into a dictionary; none of models that were saved before there were encoders."""
-    return EncoderConfig(**{**values, "dilations": tuple(values["dilations"])}) if values else EncoderConfig()
-
-
-def find_weights(name_or_path: str | Path) -> Path:
-    """The folder of a saved model: a path, or the name of one that the package ships."""
-    path = Path(name_or_path)
-    if (path / "config.json").is_file():
-        return path
-    shipped = Path(str(files("torchcrf_scan") / "weights"))
-    if (shipped / str(name_or_path) / "config.json").is_file():
-        return shipped / str(name_or_path)
-    names = sorted(entry.name for entry in shipped.iterdir()) if shipped.is_dir() else []
-    raise ValueError(
-        f"name_or_path: expected a folder with config.json or one of {', '.join(names) or 'no'} shipped models, got {path}"
-    )

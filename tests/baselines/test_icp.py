@@ -10,8 +10,8 @@ from checks import check, same
 from rooms import AWKWARD, ONE, room_pair
 
 from torchcrf_scan.baselines.icp import FOUND, GATES, choose_gate, found_shares, loose_gate, match_background, match_icp
-from torchcrf_scan.config import WORLDS
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Annotation, ScanPair
 

@@ -11,8 +11,8 @@ from rooms import AWKWARD, room_pair
 from torchcrf_scan.baselines.icp import match_icp
 from torchcrf_scan.baselines.kmeans import cluster_displacements, fit_group, group_by_size
 from torchcrf_scan.baselines.ransac import match_ransac
-from torchcrf_scan.config import WORLDS
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import PairPrediction, ScanPair

@@ -8,8 +8,8 @@ from checks import check, same
 from rooms import AWKWARD, room_pair
 
 from torchcrf_scan.baselines.ransac import Scene, find_movers, match_ransac, open_parts, search_motion, within_reach
-from torchcrf_scan.config import WORLDS
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import ScanPair

@@ -8,10 +8,10 @@ import torch
 
 from torchcrf_scan import JointScanCRF, ScanPair, ScanPairBatch
 from torchcrf_scan.baselines.start import label_nearest, match_start, match_static
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start, nearest_association
+from torchcrf_scan.inference.start import Start, nearest_association
 from torchcrf_scan.scan import Scan
 
 RING = Scan.from_ranges(np.full(8, 5.0), np.linspace(-1.4, 1.4, 8))

@@ -11,9 +11,9 @@ from rooms import AWKWARD, room_pair
 
 from torchcrf_scan.baselines.cloud import Cloud
 from torchcrf_scan.baselines.trimmed_icp import line_step, match_trimmed_icp, register_trimmed, trimmed_step
-from torchcrf_scan.config import WORLDS
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Scan, ScanPair

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
-from torchcrf_scan.learning import cross_validation, experiment
-from torchcrf_scan.learning.methods import ENCODED, EXACT, JOINT, LATTICE, LATTICE_EXACT, METHODS
+from torchcrf_scan.experiment import cross_validation, experiment
+from torchcrf_scan.experiment.methods import ENCODED, EXACT, JOINT, LATTICE, LATTICE_EXACT, METHODS
 
 PROTOCOLS = ("leave_one_pair_out", "leave_one_sequence_out")
 TABLES = {PROTOCOLS[0]: 6, PROTOCOLS[1]: 7}  # overview, I to III, how sure, differences; and those of the exact model

@@ -8,20 +8,20 @@ import numpy as np
 import torch
 from support import make_points
 from torch import Tensor
+from torchcrf_scan.inference.surface import Surface
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.compiled.field import Field, field_of
-from torchcrf_scan.compiled.hypotheses import Hypotheses, hypothesise, members_of
-from torchcrf_scan.compiled.hypothesis_features import hypothesis_features
-from torchcrf_scan.compiled.leftover import Leftover, leftover_of
-from torchcrf_scan.compiled.surface import surface_of
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import hypotheses as eager
-from torchcrf_scan.inference.surface import Surface
 from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.search.grid import Field, field_of
+from torchcrf_scan.search.hypotheses import Hypotheses, hypothesise, members_of
+from torchcrf_scan.search.hypothesis_features import hypothesis_features
+from torchcrf_scan.search.leftover import Leftover, leftover_of
+from torchcrf_scan.search.surface import surface_of
 
 PAIRS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pairs"
 SIMULATED = {

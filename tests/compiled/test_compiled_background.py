@@ -11,23 +11,24 @@ from torch import Tensor
 
 pytest.importorskip("numba")
 
-from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.compiled import background as compiled
-from torchcrf_scan.compiled import search
-from torchcrf_scan.compiled.field import Field, field_of, locate
-from torchcrf_scan.compiled.jit import Array
-from torchcrf_scan.compiled.registration import gauss_newton_step, register_both
-from torchcrf_scan.compiled.surface import surface_of
-from torchcrf_scan.compiled.threads import in_parts
-from torchcrf_scan.config import WORLDS
-from torchcrf_scan.data.pair_file import read_pair
-from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.features.potentials import PairView
-from torchcrf_scan.inference import background as eager
-from torchcrf_scan.inference import registration
 from torchcrf_scan.inference.cold import shape_association
 from torchcrf_scan.inference.initialise import find_background
 from torchcrf_scan.inference.surface import Surface
+
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.data.pair_file import read_pair
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.features.potentials import PairView
+from torchcrf_scan.inference import background as eager
+from torchcrf_scan.inference import registration
+from torchcrf_scan.loops.jit import Array
+from torchcrf_scan.loops.threads import in_parts
+from torchcrf_scan.search import background as compiled
+from torchcrf_scan.search import pool as search
+from torchcrf_scan.search.grid import Field, field_of, locate
+from torchcrf_scan.search.registration import gauss_newton_step, register_both
+from torchcrf_scan.search.surface import surface_of
 
 PAIRS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pairs"
 RECORDED = ("datmo_overtake_red_0030", "datmo_overtakes_0199", "kitti0001_f057_g2", "kitti0001_f078_g3")

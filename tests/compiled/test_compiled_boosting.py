@@ -5,7 +5,7 @@ from support import generator, normal
 
 pytest.importorskip("numba")
 
-from torchcrf_scan.compiled.boosting import margins, stumps_of
+from torchcrf_scan.fast.boosting import margins, stumps_of
 from torchcrf_scan.features.boosting import StumpEnsemble
 
 

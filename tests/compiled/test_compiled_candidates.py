@@ -10,12 +10,12 @@ from torch import Tensor
 pytest.importorskip("numba")
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.compiled.candidates import by_motion, with_targets
-from torchcrf_scan.compiled.nearest import boxes_of
-from torchcrf_scan.config import WORLDS
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.fast.candidates import by_motion, with_targets
 from torchcrf_scan.features import candidates
+from torchcrf_scan.loops.nearest import boxes_of
 
 PAIRS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pairs"
 MOTIONS = torch.tensor([[0.02, 0.5, 0.1], [3.0, 9.0, 9.0], [0.0, 1.5, 0.1], [0.1, 0.1, -0.4]], dtype=torch.float64)

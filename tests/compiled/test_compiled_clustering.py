@@ -14,14 +14,14 @@ pytest.importorskip("numba")
 
 from torchcrf_scan import JointScanCRF
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.compiled import clustering
-from torchcrf_scan.compiled.free_space import Sweep, sweep_of
-from torchcrf_scan.compiled.nearest import boxes_of
+from torchcrf_scan.fast import clustering
+from torchcrf_scan.fast.free_space import Sweep, sweep_of
 from torchcrf_scan.features import clustering as eager
 from torchcrf_scan.features.candidates import by_motion
 from torchcrf_scan.features.potentials import PairView, clustering_potentials, clustering_unary, possible_clusters
-from torchcrf_scan.inference.joint import Parameters
 from torchcrf_scan.inference.messages import chain_beliefs
+from torchcrf_scan.inference.state import Parameters
+from torchcrf_scan.loops.nearest import boxes_of
 
 C = 4
 

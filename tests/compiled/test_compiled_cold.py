@@ -11,13 +11,13 @@ from torch import Tensor
 pytest.importorskip("numba")
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.compiled import cold as compiled
-from torchcrf_scan.config import WORLDS
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import cold as eager
+from torchcrf_scan.search import cold as compiled
 
 PAIRS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pairs"
 RECORDED = ("datmo_overtake_red_0030", "datmo_overtakes_0199", "kitti0001_f057_g2", "kitti0001_f078_g3")

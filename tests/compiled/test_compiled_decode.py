@@ -14,15 +14,16 @@ from torch import Tensor
 pytest.importorskip("numba")
 
 from torchcrf_scan import JointScanCRF
-from torchcrf_scan.batch import Prediction, ScanPairBatch
-from torchcrf_scan.compiled import decode, kept_candidates
-from torchcrf_scan.compiled.candidates import by_motion
-from torchcrf_scan.compiled.nearest import boxes_of
-from torchcrf_scan.config import SimulatorConfig
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.fast import decode, kept_candidates
+from torchcrf_scan.fast.candidates import by_motion
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.loops.nearest import boxes_of
+from torchcrf_scan.prediction import Prediction
 
 EVERY = 9  # real pair
 CONFIGS: dict[str, dict[str, Any]] = {

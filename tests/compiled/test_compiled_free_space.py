@@ -11,8 +11,9 @@ from torch import Tensor
 
 pytest.importorskip("numba")
 
-from torchcrf_scan.compiled.free_space import first_from, look, sweep_of, within_circle
+from torchcrf_scan.fast.free_space import look, sweep_of
 from torchcrf_scan.features import free_space as eager
+from torchcrf_scan.loops.circle import first_from, within_circle
 
 HERE = torch.tensor([1.0, 2.0], dtype=torch.float64)
 SCANS = {

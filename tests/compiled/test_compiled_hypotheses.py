@@ -6,13 +6,13 @@ from support import assert_close
 pytest.importorskip("numba")
 
 from surveyed import PAIRS, REAL, SCENES, survey
-
-from torchcrf_scan.compiled.groups import ends
-from torchcrf_scan.compiled.hypotheses import residual_units
-from torchcrf_scan.compiled.nearest import nearest_within
-from torchcrf_scan.compiled.surface import OCCLUDED, SEEN_THROUGH, UNMEASURED
-from torchcrf_scan.inference import hypotheses as eager
 from torchcrf_scan.inference.background import unit_length
+
+from torchcrf_scan.inference import hypotheses as eager
+from torchcrf_scan.loops.nearest import nearest_within
+from torchcrf_scan.search.groups import ends
+from torchcrf_scan.search.hypotheses import residual_units
+from torchcrf_scan.search.surface import OCCLUDED, SEEN_THROUGH, UNMEASURED
 
 
 def test_real_pairs_are_among_the_scenes() -> None:

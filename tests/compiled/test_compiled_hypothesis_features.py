@@ -5,13 +5,13 @@ import torch
 pytest.importorskip("numba")
 
 from surveyed import SCENES, survey
-
-from torchcrf_scan.compiled.feature_points import AT
-from torchcrf_scan.compiled.groups import Groups
-from torchcrf_scan.compiled.hypotheses import Hypotheses
-from torchcrf_scan.compiled.hypothesis_features import hypothesis_features, share_in_common
-from torchcrf_scan.inference import hypothesis_features as eager
 from torchcrf_scan.inference.hypotheses import Hypotheses as EagerHypotheses
+
+from torchcrf_scan.inference import hypothesis_features as eager
+from torchcrf_scan.search.feature_points import AT
+from torchcrf_scan.search.groups import Groups
+from torchcrf_scan.search.hypotheses import Hypotheses
+from torchcrf_scan.search.hypothesis_features import hypothesis_features, share_in_common
 
 SINGLE = ("distinct", "target_cover", "share_of_piece", "landing_piece_cover")  # ratios of counts, which torch takes in float32
 CANCELLING = ("linearity",)  # of points on a line: the root of a difference of squares

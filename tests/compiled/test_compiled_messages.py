@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 pytest.importorskip("numba")
 
-from torchcrf_scan.compiled import messages
 from torchcrf_scan.inference.messages import chain_beliefs, log_partition
+from torchcrf_scan.loops import messages
 
 Potentials = tuple[NDArray[np.float64], NDArray[np.float64]]
 

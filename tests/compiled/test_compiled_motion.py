@@ -11,7 +11,7 @@ from torch import Tensor
 
 pytest.importorskip("numba")
 
-from torchcrf_scan.compiled import motion
+from torchcrf_scan.fast import motion
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import motion as eager
 

@@ -7,9 +7,9 @@ pytest.importorskip("numba")
 
 from surveyed import SCENES, survey
 
-from torchcrf_scan.compiled.movers import probabilities_of, score_of, select
 from torchcrf_scan.inference import movers as eager
-from torchcrf_scan.inference.hypothesis_features import FEATURES
+from torchcrf_scan.search.accept import probabilities_of, score_of, select
+from torchcrf_scan.search.score import FEATURES
 
 
 def test_probabilities_are_those_of_the_eager_module() -> None:

@@ -13,13 +13,14 @@ pytest.importorskip("numba")
 
 from torchcrf_scan import JointScanCRF
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.compiled import decode, selection
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.fast import decode, selection
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.inference import selection as eager
-from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.joint import State, first_state
+from torchcrf_scan.inference.joint import first_state
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.state import State
 
 
 @cache

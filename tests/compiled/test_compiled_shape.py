@@ -10,11 +10,11 @@ from torch import Tensor
 pytest.importorskip("numba")
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.compiled.shape import describe, local_spacing, resolution
-from torchcrf_scan.config import WORLDS
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.features import potentials, shape
+from torchcrf_scan.loops.shape import describe, local_spacing, resolution
 
 PAIRS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pairs"
 SCANS = {

@@ -7,11 +7,12 @@ pytest.importorskip("numba")
 
 from surveyed import SCENES, survey
 
-from torchcrf_scan.compiled.movers import score_of
-from torchcrf_scan.compiled.start import Start, choose_movers
 from torchcrf_scan.features.potentials import resolution
 from torchcrf_scan.inference import initialise as eager
-from torchcrf_scan.inference.movers import HypothesisScore
+from torchcrf_scan.loops.pair import Start
+from torchcrf_scan.search.accept import score_of
+from torchcrf_scan.search.choose import choose_movers
+from torchcrf_scan.search.score import HypothesisScore
 
 
 def choose(name: str, clusters: int) -> tuple[Start, eager.Start]:

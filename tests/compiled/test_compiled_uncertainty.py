@@ -12,8 +12,8 @@ from torch import Tensor
 
 pytest.importorskip("numba")
 
-from torchcrf_scan.compiled import uncertainty
-from torchcrf_scan.compiled.motion import METRICS
+from torchcrf_scan.fast import uncertainty
+from torchcrf_scan.fast.motion import METRICS
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import uncertainty as eager
 from torchcrf_scan.inference.motion import hard_support

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from support import generator
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import AugmentConfig, SimulatorConfig
-from torchcrf_scan.data.augment import add_noise, augment, drop_returns, frame_offset, mirror
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.learning.augment import add_noise, augment, drop_returns, frame_offset, mirror
+from torchcrf_scan.learning.settings import AugmentConfig
 from torchcrf_scan.scan import Annotation, Scan, ScanPair
 
 SEEDS = st.integers(0, 2**31)

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data import simulate, world
 from torchcrf_scan.data.simulate import cast, simulate_pairs
 from torchcrf_scan.data.world import Mover, Shapes
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import ScanPair
 

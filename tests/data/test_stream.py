@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchcrf_scan.config import GradientConfig, SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.data.stream import PairStream, Parts, Sample, seed_of
+from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.learning.settings import GradientConfig
+from torchcrf_scan.learning.stream import PairStream, Parts, Sample, seed_of
 
 
 def same(a: Sample, b: Sample) -> bool:

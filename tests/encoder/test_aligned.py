@@ -9,12 +9,13 @@ import torch
 from support import assert_close, normal
 
 from torchcrf_scan import Scan, ScanPair, ScanPairBatch
-from torchcrf_scan.backend import is_numba_installed
-from torchcrf_scan.config import WORLDS
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.encoder.aligned import CHANNELS, FARTHEST, aligned_inputs
+from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.encoder.aligned import aligned_inputs
+from torchcrf_scan.encoder.channels import CHANNELS, FARTHEST
+from torchcrf_scan.fast.choice import is_numba_installed
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.start import Start
 
 MOTIONS = torch.tensor([[0.02, -0.3, 0.05], [0.0, 0.4, -0.1], [0.3, 0.0, 0.0]], dtype=torch.float64)
 

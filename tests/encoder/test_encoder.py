@@ -8,16 +8,18 @@ import torch
 from support import assert_close, normal
 
 from torchcrf_scan import JointScanCRF, ScanPairBatch
-from torchcrf_scan.backend import is_numba_installed
-from torchcrf_scan.config import Config, EncoderConfig, FeatureConfig, GradientConfig, LearningConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.config import EncoderConfig, FeatureConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.encoder.encoder import ScanEncoder, unroll
+from torchcrf_scan.experiment.methods import with_config
 from torchcrf_scan.export import UnrolledDecoder, decoder_inputs
+from torchcrf_scan.fast.choice import is_numba_installed
 from torchcrf_scan.features.learned import ExtraLogUnary
 from torchcrf_scan.learning.checkpoint import load_weights
-from torchcrf_scan.learning.methods import with_config
 from torchcrf_scan.learning.objectives import make_objective
 from torchcrf_scan.learning.portions import as_portion
+from torchcrf_scan.learning.settings import Config, GradientConfig, LearningConfig
 from torchcrf_scan.scan import ScanPair
 
 SMALL = EncoderConfig(width=8, dilations=(1, 2))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from made_pairs import make_pair, perfect, perturbed
 
-from torchcrf_scan.evaluation.ablation import ablation_table
 from torchcrf_scan.evaluation.bootstrap import Interval, by_sequence, paired_intervals
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import DIFFERENCES, OVERVIEW
 from torchcrf_scan.evaluation.summary import summarise
+from torchcrf_scan.experiment.ablation import ablation_table
 
 SECONDS = {"model": [0.1, 0.4, 0.2, 0.3], "worse": [1.0, 3.0, 2.0, 5.0], "fewer": [0.5, 0.5]}
 

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import all_real, assert_close, generator, make_points, pad, polar
 from torch import Tensor
+from torchcrf_scan.inference.surface import Surface, look_along
 
 from torchcrf_scan.features.free_space import FreeSpace, Sweep, look
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.surface import Surface, look_along
 
 SEEDS = st.integers(0, 10_000)
 ANGLES = st.floats(-math.pi, math.pi)

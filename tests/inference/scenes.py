@@ -6,10 +6,11 @@ import torch
 from support import assert_close, generator, make_points, normal
 from torch import Tensor
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start, nearest_association
+from torchcrf_scan.inference.start import Start, nearest_association
+from torchcrf_scan.prediction import Prediction
 
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3], [0.2, -0.2, -1.0]], dtype=torch.float64)
 CASES = ("all outliers", "empty source", "empty target", "one point", "duplicates", "background only")

@@ -10,19 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import assert_close, generator, normal, polar
 from torch import Tensor
-
-from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import MODEL_CARS, SimulatorConfig
-from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.features.potentials import PairView
-from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.background import (
-    CONTRADICTION,
-    COST_SHARE,
-    SLIDE_STEP,
-    SLIDES,
-    TRUNCATION,
-    UNSEEN,
     background_cost,
     background_pool,
     distinct,
@@ -34,8 +22,16 @@ from torchcrf_scan.inference.background import (
 )
 from torchcrf_scan.inference.cold import shape_association
 from torchcrf_scan.inference.initialise import find_background
-from torchcrf_scan.inference.registration import ROUGHNESS
 from torchcrf_scan.inference.surface import Surface, look_along
+
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import MODEL_CARS, SimulatorConfig
+from torchcrf_scan.features.potentials import PairView
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.search.background import CONTRADICTION, TRUNCATION, UNSEEN
+from torchcrf_scan.search.grid import COST_SHARE, ROUGHNESS
+from torchcrf_scan.search.pool import SLIDE_STEP, SLIDES
 
 NOISE = torch.tensor(0.01, dtype=torch.float64)
 STILL = torch.zeros(3, dtype=torch.float64)

@@ -7,16 +7,19 @@ import torch
 from support import assert_close, generator, make_points, normal
 from torch import Tensor
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
-from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import Scales
-from torchcrf_scan.inference import flooding, joint, motion
-from torchcrf_scan.inference.initialise import Start, nearest_association
-from torchcrf_scan.inference.joint import Parameters
+from torchcrf_scan.inference import joint, motion
 from torchcrf_scan.inference.motion import Motions, RunningSums
+from torchcrf_scan.inference.start import Start, nearest_association
+from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.prediction import Prediction
+from torchcrf_scan.variants import flooding
 
 N, M = 6, 5
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3], [0.2, -0.2, -1.0]], dtype=torch.float64)

@@ -2,7 +2,6 @@ import math
 
 import torch
 from torch import Tensor
-
 from torchcrf_scan.inference.hypotheses import ends, hypothesise, pieces
 from torchcrf_scan.inference.surface import Surface
 

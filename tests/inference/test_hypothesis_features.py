@@ -2,10 +2,11 @@ import math
 
 import torch
 from torch import Tensor
-
 from torchcrf_scan.inference.hypotheses import Hypotheses
-from torchcrf_scan.inference.hypothesis_features import FEATURES, hypothesis_features
+from torchcrf_scan.inference.hypothesis_features import hypothesis_features
 from torchcrf_scan.inference.surface import Surface
+
+from torchcrf_scan.search.score import FEATURES
 
 NOISE = torch.tensor(0.01)
 STEP = math.radians(0.5)

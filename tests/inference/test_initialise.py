@@ -7,18 +7,21 @@ import pytest
 import torch
 from support import assert_close, make_points, normal
 from torch import Tensor
+from torchcrf_scan.inference.cold import shape_association
+from torchcrf_scan.inference.initialise import initialise
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.cold import ransac_motions, shape_association
-from torchcrf_scan.inference.initialise import FOOTPRINT, Start, initialise, nearest_association
-from torchcrf_scan.inference.movers import HypothesisScore
-from torchcrf_scan.inference.paper_start import EXPLAINED, FEWEST, movers_from_associations, run_motions
+from torchcrf_scan.inference.start import FOOTPRINT, Start, nearest_association
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import Scan, ScanPair
+from torchcrf_scan.search.cold import ransac_motions
+from torchcrf_scan.search.score import HypothesisScore
+from torchcrf_scan.variants.paper_start import EXPLAINED, FEWEST, movers_from_associations, run_motions
 
 ROTATION, TRANSLATION = np.radians(1.0), 0.05
 OFFSET = np.array([-0.35, 2.8, 2.1])  # 3.5 m

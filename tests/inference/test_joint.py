@@ -10,16 +10,18 @@ from scenes import CASES, MOTIONS, assert_identical, assert_same, assert_sane, m
 from support import PAPER_ASSOCIATION, PAPER_CLUSTERING, assert_close, generator, make_points, normal, paper_weights
 from torch import Tensor
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
-from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.initialise import Start, nearest_association
-from torchcrf_scan.inference.joint import Parameters
+from torchcrf_scan.inference.start import Start, nearest_association
+from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
+from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import Scan, ScanPair
 
 MODEL = JointScanCRF().double()

@@ -25,11 +25,11 @@ from scenes import (
 from support import PAPER_WEIGHTS, all_real, assert_close, extended, generator, make_points, normal
 from torch import Tensor
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
-from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features import clustering
-from torchcrf_scan.features.lattice import LatticeFeatures, LatticePotentials, lattice_features, transition_kinds
 from torchcrf_scan.features.potentials import (
     AssociationStates,
     Boosters,
@@ -43,11 +43,13 @@ from torchcrf_scan.features.potentials import (
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.joint import Parameters
-from torchcrf_scan.inference.lattice import LatticeBeliefs, lattice_beliefs, lattice_log_partition, lattice_messages
 from torchcrf_scan.inference.messages import chain_beliefs, log_partition
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
+from torchcrf_scan.prediction import Prediction
+from torchcrf_scan.variants.lattice import LatticeBeliefs, lattice_beliefs, lattice_log_partition, lattice_messages
+from torchcrf_scan.variants.lattice_features import LatticeFeatures, LatticePotentials, lattice_features, transition_kinds
 
 SEEDS = st.integers(0, 10_000)
 NODES, CANDIDATES, CLUSTERS = st.integers(1, 4), st.integers(0, 2), st.integers(1, 2)

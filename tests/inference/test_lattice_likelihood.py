@@ -12,18 +12,20 @@ from support import assert_close, extended, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
-from torchcrf_scan.config import FeatureConfig, InferenceConfig, LearningConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.features.lattice import LatticeFeatures, lattice_features
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, find_candidates, possible_clusters
 from torchcrf_scan.features.scales import LOCAL_CHANNELS, Scales
-from torchcrf_scan.inference.joint import Parameters
-from torchcrf_scan.inference.lattice_likelihood import LatticeChain, lattice_chain, pseudo_log_likelihood
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
+from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.learning.fit import Lesson, fit_lattice
 from torchcrf_scan.learning.plugins import training_plugins
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.learning.weights_fit import fit_chain, flatten, stack
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.variants.lattice_features import LatticeFeatures, lattice_features
+from torchcrf_scan.variants.lattice_likelihood import LatticeChain, lattice_chain, pseudo_log_likelihood
 
 N, M, C = 4, 2, 2
 DENSE = InferenceConfig(clusters=C + 1, candidates=0)

@@ -4,11 +4,12 @@ import torch
 from support import assert_close
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.potentials import PairView
-from torchcrf_scan.inference.joint import State, merge_alike
+from torchcrf_scan.inference.joint import merge_alike
 from torchcrf_scan.inference.motion import Motions
+from torchcrf_scan.inference.state import State
 
 
 def state_with(view: PairView, motions: list[list[float]]) -> State:

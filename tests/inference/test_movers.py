@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-
-from torchcrf_scan.config import SimulatorConfig
-from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise
-from torchcrf_scan.inference.hypothesis_features import FEATURES, hypothesis_features
-from torchcrf_scan.inference.movers import PRODUCTS, HypothesisScore, Movers, select
+from torchcrf_scan.inference.hypothesis_features import hypothesis_features
+from torchcrf_scan.inference.movers import Movers, select
 from torchcrf_scan.inference.surface import Surface
+
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.geometry import se2
 from torchcrf_scan.learning.hypothesis_fit import (
     IGNORED,
     fit_hypothesis_score,
@@ -22,6 +22,7 @@ from torchcrf_scan.learning.hypothesis_fit import (
     view_pair,
 )
 from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.search.score import FEATURES, PRODUCTS, HypothesisScore
 
 NOISE = torch.tensor(0.01)
 DT = 0.2

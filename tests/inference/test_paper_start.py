@@ -9,15 +9,16 @@ from scenes import CASES, assert_sane, poor_scene
 from support import assert_close, make_points, normal
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.features.scales import LOCAL_CHANNELS, SHAPE_CHANNELS
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.paper_start import EXPLAINED, agreed_motion, match_cold, paper_start
-from torchcrf_scan.inference.points_start import cluster_by_point, points_start
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.variants.paper_start import EXPLAINED, agreed_motion, match_cold, paper_start
+from torchcrf_scan.variants.points_start import cluster_by_point, points_start
 
 CONFIG = InferenceConfig(clusters=5)
 Look = Callable[..., Start]

@@ -12,13 +12,13 @@ from support import assert_close, extended, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
-from torchcrf_scan.config import InferenceConfig, ModelConfig, SimulatorConfig
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.candidates import with_targets
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import CLUSTERING_UNARY, Scales
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.joint import Parameters
 from torchcrf_scan.inference.pseudo_likelihood import (
     Design,
     PlugIns,
@@ -29,6 +29,7 @@ from torchcrf_scan.inference.pseudo_likelihood import (
     pseudo_log_likelihood,
     true_plugins,
 )
+from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
 
 N, M, C = 6, 5, 3

@@ -7,18 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import assert_close, generator, normal, polar
 from torch import Tensor
+from torchcrf_scan.inference.registration import nearest_points, register, register_both, surface_residual
+from torchcrf_scan.inference.surface import Surface
 
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
-from torchcrf_scan.inference.registration import (
-    ROUGHNESS,
-    gauss_newton_step,
-    nearest_points,
-    register,
-    register_both,
-    surface_residual,
-)
-from torchcrf_scan.inference.surface import Surface
+from torchcrf_scan.inference.motion import gauss_newton_step
+from torchcrf_scan.search.grid import ROUGHNESS
 
 SEEDS = st.integers(0, 10_000)
 STILL = torch.zeros(1, 3, dtype=torch.float64)

@@ -14,9 +14,9 @@ from torchcrf_scan.features import clustering
 from torchcrf_scan.features.potentials import Boosters, PairView, clustering_unary
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_UNARY, CLUSTERING_WEIGHTS, Scales
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.joint import Parameters
 from torchcrf_scan.inference.selection import ClusterPotential, discard_vacuous, evidence
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.model import JointScanCRF
 
 CONFIG = InferenceConfig(clusters=4)

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import assert_close, make_points, normal, polar
 from torch import Tensor
+from torchcrf_scan.inference.surface import Sight, Surface, carry_back, look_along
 
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.surface import Sight, Surface, carry_back, look_along
 
 NOISE = torch.tensor(0.01, dtype=torch.float64)
 

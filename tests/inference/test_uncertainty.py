@@ -10,14 +10,12 @@ from hypothesis import strategies as st
 from support import assert_close, normal
 from torch import Tensor
 
-from torchcrf_scan.batch import Prediction
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
 from torchcrf_scan.inference.motion import Support, hard_support, line_fit
 from torchcrf_scan.inference.uncertainty import (
     RUN,
     Calibration,
-    Uncertainty,
     association_log_odds,
     cluster_log_odds,
     log_odds,
@@ -25,6 +23,7 @@ from torchcrf_scan.inference.uncertainty import (
     shared_scores,
     surface_tangents,
 )
+from torchcrf_scan.prediction import Prediction, Uncertainty
 
 NOISE = 0.01
 SCALE = torch.tensor(0.2, dtype=torch.float64)

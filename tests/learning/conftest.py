@@ -2,17 +2,12 @@
 
 import pytest
 
-from torchcrf_scan.config import (
-    Config,
-    ExperimentConfig,
-    FeatureConfig,
-    InferenceConfig,
-    LearningConfig,
-    ModelConfig,
-    SimulatorConfig,
-)
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.learning.methods import Models, Study, fit_models
+from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.experiment.methods import Models, Study, fit_models
+from torchcrf_scan.experiment.settings import ExperimentConfig
+from torchcrf_scan.learning.settings import Config, LearningConfig
 from torchcrf_scan.scan import ScanPair
 
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchcrf_scan.learning import cross_validation
-from torchcrf_scan.learning.methods import JOINT, Answer, Models, Study
+from torchcrf_scan.experiment import cross_validation
+from torchcrf_scan.experiment.methods import JOINT, Answer, Models, Study
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
 
 BEAMS = 12

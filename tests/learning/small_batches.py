@@ -8,9 +8,10 @@ from torch import Tensor
 
 from torchcrf_scan import ClusteringCRF, ExtraLogUnary, JointScanCRF, MatchingCRF
 from torchcrf_scan.batch import ScanPairBatch, Truth
-from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig, UnrolledConfig
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.learning.settings import UnrolledConfig
 
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3], [0.2, -0.2, -1.0]], dtype=torch.float64)
 KINDS = ("ordinary", "duplicates", "line", "origin", "all outliers", "one point", "empty", "far", "padding", "unmoved")

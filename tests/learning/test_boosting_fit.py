@@ -10,8 +10,9 @@ from sklearn.tree import DecisionTreeClassifier
 from support import generator, make_points
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import InferenceConfig, SimulatorConfig
+from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.features.potentials import OUTLIER_INPUTS, Boosters, PairView
 from torchcrf_scan.features.scales import LOCAL_CHANNELS, Scales

@@ -8,10 +8,10 @@ import pytest
 import torch
 from scipy.special import expit
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
-from torchcrf_scan.config import Config
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.evaluation.calibration import consistency, expected_calibration_error
 from torchcrf_scan.evaluation.metrics import score_pair
+from torchcrf_scan.experiment.methods import JOINT, Models, Study
 from torchcrf_scan.inference.uncertainty import Calibration
 from torchcrf_scan.learning import calibration_fit
 from torchcrf_scan.learning.calibration_fit import (
@@ -23,8 +23,9 @@ from torchcrf_scan.learning.calibration_fit import (
     judge,
     moving_share,
 )
-from torchcrf_scan.learning.methods import JOINT, Models, Study
+from torchcrf_scan.learning.settings import Config
 from torchcrf_scan.model import MatchingCRF
+from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import ScanPair
 
 

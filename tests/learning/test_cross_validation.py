@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from made_up import RIVAL, Recorder, guess, make_pairs, make_study
 
-from torchcrf_scan.config import Config
-from torchcrf_scan.learning import cross_validation
-from torchcrf_scan.learning.cross_validation import SECONDS, Fold, cores, file_name, make_folds, read_folds, run_folds, write_fold
-from torchcrf_scan.learning.methods import JOINT, METHODS, Answer
+from torchcrf_scan.experiment import cross_validation
+from torchcrf_scan.experiment.cross_validation import SECONDS, Fold, cores, file_name, make_folds, read_folds, run_folds, write_fold
+from torchcrf_scan.experiment.methods import JOINT, METHODS, Answer
+from torchcrf_scan.learning.settings import Config
 from torchcrf_scan.scan import ScanPair
 
 BY_PAIR, BY_SEQUENCE = "leave_one_pair_out", "leave_one_sequence_out"
@@ -186,7 +186,7 @@ import os, sys
 from pathlib import Path
 from made_up import Recorder, make_pairs, make_study
 from torchcrf_scan.config import Config
-from torchcrf_scan.learning.cross_validation import make_folds, run_folds
+from torchcrf_scan.experiment.cross_validation import make_folds, run_folds
 rank, pairs, recorder = os.environ["RANK"], make_pairs(*"aabc"), Recorder()
 recorder.install()
 protocols = ("leave_one_pair_out", "leave_one_sequence_out")

@@ -8,8 +8,8 @@ import pytest
 import torch
 from support import assert_close
 
-from torchcrf_scan.config import LearningConfig
 from torchcrf_scan.inference.pseudo_likelihood import Chain
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.learning.weights_fit import fit_chain, stack
 
 

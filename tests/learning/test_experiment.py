@@ -11,12 +11,12 @@ from made_up import RIVAL, Recorder, guess, make_pairs, make_study
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchcrf_scan.config import Config, ExperimentConfig, InferenceConfig, LearningConfig, ModelConfig
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.evaluation.report import Table
-from torchcrf_scan.learning import experiment as module
-from torchcrf_scan.learning.experiment import (
+from torchcrf_scan.experiment import experiment as module
+from torchcrf_scan.experiment.experiment import (
     claim,
     differing,
     find_pairs,
@@ -26,7 +26,9 @@ from torchcrf_scan.learning.experiment import (
     worst_pairs,
     write_tables,
 )
-from torchcrf_scan.learning.methods import JOINT, Study
+from torchcrf_scan.experiment.methods import JOINT, Study
+from torchcrf_scan.experiment.settings import ExperimentConfig
+from torchcrf_scan.learning.settings import Config, LearningConfig
 
 SMALL = ExperimentConfig(jobs=1, resamples=20)
 

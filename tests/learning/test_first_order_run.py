@@ -9,10 +9,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_trainer import load_main
 
 from torchcrf_scan.commands.experiment import experiment
-from torchcrf_scan.config import AugmentConfig, Config, DataConfig, GradientConfig, LearningConfig, SimulatorConfig
 from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning.checkpoint import Store
+from torchcrf_scan.learning.settings import AugmentConfig, Config, DataConfig, GradientConfig, LearningConfig
 from torchcrf_scan.learning.trainer import flatten, hold_out, load_data, load_weights, settings_of
 from torchcrf_scan.model import JointScanCRF
 

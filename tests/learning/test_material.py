@@ -7,15 +7,15 @@ import pytest
 import torch
 from support import assert_close
 from torch import Tensor
+from torchcrf_scan.inference.initialise import initialise
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import LearningConfig
-from torchcrf_scan.inference.initialise import initialise
-from torchcrf_scan.inference.movers import HypothesisScore
+from torchcrf_scan.experiment.methods import Study
 from torchcrf_scan.learning import material as material_module
 from torchcrf_scan.learning.material import Collection, assign_folds, collect
-from torchcrf_scan.learning.methods import Study
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.search.score import HypothesisScore
 
 UNDISTURBED = LearningConfig(disturbance=0.0, folds=2, batch_size=2)
 

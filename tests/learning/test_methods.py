@@ -10,10 +10,8 @@ import pytest
 import torch
 
 from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
-from torchcrf_scan.config import Config, EncoderConfig, GradientConfig
-from torchcrf_scan.geometry import se2
-from torchcrf_scan.learning.calibration_fit import calibrate
-from torchcrf_scan.learning.methods import (
+from torchcrf_scan.config import EncoderConfig
+from torchcrf_scan.experiment.methods import (
     ENCODED,
     EXACT,
     JOINT,
@@ -28,6 +26,9 @@ from torchcrf_scan.learning.methods import (
     with_config,
     with_motions_given,
 )
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.learning.calibration_fit import calibrate
+from torchcrf_scan.learning.settings import Config, GradientConfig
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
@@ -50,7 +51,7 @@ def test_a_library_has_its_row_where_it_is_installed(
     answers: dict[str, Answer], models: Models, small_pairs: list[ScanPair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     still = answers["all background"].prediction
-    monkeypatch.setattr("torchcrf_scan.learning.methods.installed_libraries", lambda: dict.fromkeys(LIBRARIES, lambda _: still))
+    monkeypatch.setattr("torchcrf_scan.experiment.methods.installed_libraries", lambda: dict.fromkeys(LIBRARIES, lambda _: still))
     found = answer(models, small_pairs[5])
     assert set(found) == set(METHODS) - {ENCODED}
     assert all(found[name].prediction is still for name in LIBRARIES)

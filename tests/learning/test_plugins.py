@@ -6,11 +6,11 @@ from support import assert_close, generator, make_points
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
-from torchcrf_scan.config import LearningConfig
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.plugins import match_start, mix_associations, training_plugins
+from torchcrf_scan.learning.settings import LearningConfig
 
 N = 20
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 1.9, 0.3], [0.2, -0.2, -2.0]], dtype=torch.float64)

@@ -12,10 +12,10 @@ import torch
 from support import assert_close
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import AugmentConfig, GradientConfig
-from torchcrf_scan.data.stream import PairStream, Parts
 from torchcrf_scan.learning.objectives import known_nodes, start_of
 from torchcrf_scan.learning.portions import Collate, Portion, as_portion, load_portions
+from torchcrf_scan.learning.settings import AugmentConfig, GradientConfig
+from torchcrf_scan.learning.stream import PairStream, Parts
 from torchcrf_scan.model import JointScanCRF
 
 MOVED = AugmentConfig(mirror=0.0, dropout=0.0, noise=0.0, frame_rotation=0.3, frame_translation=0.1)

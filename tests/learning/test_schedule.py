@@ -7,8 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchcrf_scan.config import GradientConfig
 from torchcrf_scan.learning.schedule import EarlyStopping, make_schedule, rate_at
+from torchcrf_scan.learning.settings import GradientConfig
 
 
 @given(steps=st.integers(1, 60), warmup=st.integers(0, 80), final=st.floats(0, 1))

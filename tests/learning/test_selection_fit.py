@@ -9,7 +9,7 @@ from support import generator, make_points, normal
 from torchcrf_scan.batch import ScanPairBatch, Truth
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start, nearest_association
+from torchcrf_scan.inference.start import Start, nearest_association
 from torchcrf_scan.learning import selection_fit
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.learning.selection_fit import fit_potential, is_true_mover, judge_clusters

@@ -16,11 +16,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchcrf_scan import ClusteringCRF, ExtraLogUnary, JointScanCRF, MatchingCRF
 from torchcrf_scan.batch import ScanPairBatch, Truth
-from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig, UnrolledConfig
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.joint import State
 from torchcrf_scan.inference.motion import Motions
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.state import State
+from torchcrf_scan.learning.settings import UnrolledConfig
 from torchcrf_scan.learning.unrolled import (
     add,
     association_sum,

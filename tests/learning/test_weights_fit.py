@@ -8,8 +8,8 @@ import torch
 from support import assert_close, generator, normal
 from torch import Tensor
 
-from torchcrf_scan.config import LearningConfig
 from torchcrf_scan.inference.pseudo_likelihood import Design
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.learning.weights_fit import fit_weights, flatten
 
 EXACT = LearningConfig(tolerance=1e-9, max_steps=500)

@@ -8,7 +8,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams import plugin_data_pb2
 
 from torchcrf_scan.evaluation.report import Table
-from torchcrf_scan.viz.tensorboard import RunLog
+from torchcrf_scan.learning.run_log import RunLog
 
 
 def read(folder: Path) -> EventAccumulator:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch, scale_motions
-from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.paper_start import movers_from_associations
+from torchcrf_scan.batch import ScanPairBatch, scale_motions
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import ClusteringCRF, MatchingCRF
+from torchcrf_scan.prediction import Prediction
+from torchcrf_scan.variants.paper_start import movers_from_associations
 
 
 class Cascade:

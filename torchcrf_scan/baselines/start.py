@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start, nearest_association
+from torchcrf_scan.inference.start import Start, nearest_association
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 

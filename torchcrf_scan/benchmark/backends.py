@@ -6,7 +6,7 @@ import copy
 from collections.abc import Sequence
 from dataclasses import replace
 
-from torchcrf_scan.backend import is_numba_installed
+from torchcrf_scan.fast.choice import is_numba_installed
 from torchcrf_scan.model import JointScanCRF
 
 BACKENDS = ("compiled", "eager")

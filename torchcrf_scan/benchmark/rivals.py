@@ -99,7 +99,7 @@ def chain_of_eager(unary: Tensor, transition: Tensor) -> Decode:
 
 def chain_of_compiled(unary: Tensor, transition: Tensor) -> Decode:
     """The same in machine code."""
-    messages: Any = import_module("torchcrf_scan.compiled.messages")
+    messages: Any = import_module("torchcrf_scan.loops.messages")
     nodes, edges = unary.double().numpy(), transition.double().expand(len(unary) - 1, -1, -1).contiguous().numpy()
     return lambda: messages.max_marginals(nodes, edges).argmax(-1)
 

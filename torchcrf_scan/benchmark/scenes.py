@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchcrf_scan.config import WORLDS
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.scan import BACKGROUND, ScanPair
 
 MODES = ("cold", "warm")  # without and with a prior motion

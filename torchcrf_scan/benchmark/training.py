@@ -10,11 +10,12 @@ from typing import Any, TypeVar
 import torch
 
 from torchcrf_scan.benchmark.timing import threads_kept
-from torchcrf_scan.config import LearningConfig, ModelConfig
+from torchcrf_scan.config import ModelConfig
+from torchcrf_scan.experiment.cross_validation import cores
 from torchcrf_scan.learning.calibration_fit import calibrate
-from torchcrf_scan.learning.cross_validation import cores
 from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.material import collect
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from torchcrf_scan.commands.arguments import make_folder
-from torchcrf_scan.model import PRETRAINED
+from torchcrf_scan.pretrained import PRETRAINED
 
 
 def bench(
@@ -49,8 +49,9 @@ def bench(
     from torchcrf_scan.benchmark.report import report_tables, write_report
     from torchcrf_scan.benchmark.scenes import street_pairs
     from torchcrf_scan.benchmark.study import run_study
-    from torchcrf_scan.config import LearningConfig, ModelConfig
+    from torchcrf_scan.config import ModelConfig
     from torchcrf_scan.data.dataset import PairFiles
+    from torchcrf_scan.learning.settings import LearningConfig
 
     for name, values in {"beams": beams, "batches": batches, "threads": threads}.items():
         if not values or min(values) < 1:

@@ -18,7 +18,8 @@ from torchcrf_scan.commands import frames
 from torchcrf_scan.commands.arguments import batches, find_files, load_model, make_folder
 from torchcrf_scan.commands.frames import FrameOffset, Turn, match_displaced
 from torchcrf_scan.data.pair_file import read_pair, read_prediction
-from torchcrf_scan.model import PRETRAINED, JointScanCRF
+from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 if TYPE_CHECKING:

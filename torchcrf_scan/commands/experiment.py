@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 from jsonargparse import ArgumentError, ArgumentParser
 
-from torchcrf_scan.config import Config
+from torchcrf_scan.learning.settings import Config
 
 
 def experiment(*, ablations: str | None = None, **settings: Any) -> int:
@@ -22,7 +22,7 @@ def experiment(*, ablations: str | None = None, **settings: Any) -> int:
         ablations: folder of YAML files, each a variant of the settings; only the joint model is run, one table is printed
         settings: the fields of `Config`
     """
-    from torchcrf_scan.learning.experiment import run_ablations, run_experiment
+    from torchcrf_scan.experiment.experiment import run_ablations, run_experiment
 
     config = Config(**{name: value for name, value in settings.items() if name != "config"})
     if config.first_order != "none" and config.model.encoder.width == 0:

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.baselines.start import label_nearest
-from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.uncertainty import Uncertainty
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.prediction import Prediction, Uncertainty
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 Turn = float | Literal["any"]

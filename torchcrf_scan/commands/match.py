@@ -15,7 +15,8 @@ from torchcrf_scan.commands.failures import attempt, one_line
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.velocity import ground_velocity
-from torchcrf_scan.model import PRETRAINED, JointScanCRF
+from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.scan import BACKGROUND, PairPrediction, ScanPair
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from torchcrf_scan.commands.arguments import make_folder
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.pair_file import write_pair
+from torchcrf_scan.data.worlds import SimulatorConfig
 
 
 def simulate(output: str, simulator: SimulatorConfig, *, pairs: int = 31, sequences: int = 8, seed: int = 0) -> int:

@@ -10,8 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.world import Mover, Shapes, Viewer, World, draw_mover, indoor, street
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import MAX_RANGE_MARGIN, OUTLIER, Annotation, Bools, Floats, Ints, Scan, ScanPair
 

@@ -11,27 +11,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchcrf_scan.backend import can_search
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.encoder.aligned_loops import aligned_inputs_of_pairs
+from torchcrf_scan.encoder.channels import BESIDE, FARTHEST, LARGEST_TURN, LONGEST_CHORD, NEAR, NOWHERE, PROFILE, WINDOW
+from torchcrf_scan.fast.choice import can_run
 from torchcrf_scan.features.free_space import Sweep, bearing_in, look, rising_turn
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start
-
-BESIDE = (-2, -1, 1, 2)  # points of its own scan that a point is compared with
-WINDOW = 6  # beams of the other scan to each side, among which the nearest point is looked for
-PROFILE = 3  # of them that are shown to the encoder one by one
-FARTHEST = 20.0  # units; farther is all the same
-LARGEST_TURN = 5.0  # beam steps, likewise
-NOWHERE = 2.5  # stands for a difference of ranges where there is no other point
-NEAR = 3.0  # units within which a mover counts where nobody knows its reach
-LONGEST_CHORD = 4.0  # units; neighbouring points farther apart are no surface between them
-CHANNELS = (
-    *(f"range of the point {k:+d} beside" for k in BESIDE),
-    *("turn to the point before", "turn to the point after", "footprint over noise", "range over the usual range"),
-    *(f"range of the other scan's beam {k:+d}" for k in range(-PROFILE, PROFILE)),
-    *("turn from the beam before", "turn to the beam after", "distance to its nearest point", "distance to its surface"),
-    *("seen through", "hidden", "distance under the best mover", "probability of that mover", "gain of the best mover", "is there"),
-)
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.loops.pair import pair_of
+from torchcrf_scan.search.pairs import start_arrays
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +47,11 @@ def aligned_inputs(batch: ScanPairBatch, start: Start, backend: str = "auto", *,
 
     start: as `initialise` gives it. backend: see `InferenceConfig`.
     """
-    if can_search(backend, batch.source):
-        from torchcrf_scan.compiled import pair
-
-        return pair.aligned_inputs(batch, start, both=both)
+    if can_run(backend, batch.source.device):
+        pairs = [pair_of(batch, b) for b in range(len(batch))]
+        starts = [start_arrays(start, b, pair) for b, pair in enumerate(pairs)]
+        lengths = batch.source.shape[1], batch.target.shape[1]
+        return tuple(of.to(batch.source) for of in aligned_inputs_of_pairs(pairs, starts, lengths, both=both))
     here = torch.zeros_like(batch.target_origin)
     source = Sweep.of(batch.source, batch.source_mask, batch.source_closed, batch.range_noise, here)
     target = Sweep.of(batch.target, batch.target_mask, batch.target_closed, batch.range_noise, batch.target_origin)

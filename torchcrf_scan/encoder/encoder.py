@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,9 +10,12 @@ from torch import Tensor, nn
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import EncoderConfig
-from torchcrf_scan.encoder.aligned import CHANNELS, aligned_inputs
-from torchcrf_scan.features.learned import ExtraLogUnary
-from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.encoder.aligned import aligned_inputs
+from torchcrf_scan.encoder.aligned_loops import aligned_inputs_of_pairs
+from torchcrf_scan.encoder.channels import CHANNELS
+from torchcrf_scan.features.learned import ExtraLogUnary, LearnedInputs
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.loops.pair import Pair, PairStart
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +57,16 @@ class ScanEncoder(nn.Module):
             return Encoded(extra)
         of_target = self.encode(target[0].to(self.last.weight), batch.target_mask, batch.target_closed).to(source)
         return Encoded(extra, logits[..., 2:], of_target[..., 2:])
+
+    def of_pairs(self, pairs: Sequence[Pair], starts: Sequence[PairStart]) -> LearnedInputs:
+        """The log potentials of pairs as arrays, under their starts' motions; without embeddings."""
+        points = torch.tensor([len(pair.source) for pair in pairs])
+        longest = max(1, int(points.max())), max(1, max(len(pair.target) for pair in pairs))
+        (inputs,) = aligned_inputs_of_pairs(pairs, starts, longest, both=False)
+        mask = torch.arange(longest[0]) < points[:, None]
+        closed = torch.tensor([pair.source_closed for pair in pairs])
+        logits = self.encode(inputs.to(self.last.weight), mask, closed)
+        return LearnedInputs(None, logits[..., 0], logits[..., 1])
 
     def encode(self, inputs: Tensor, mask: Tensor, closed: Tensor) -> Tensor:
         """(B, P, 2 + E) outlier, moving, embedding of every point. inputs: (B, P, F); mask: (B, P); closed: (B,)."""

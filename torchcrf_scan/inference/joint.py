@@ -7,21 +7,18 @@ A pair that has settled is frozen, so that it does not matter which other pairs 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from torchcrf_scan.batch import Prediction
 from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.association import pairwise_features
 from torchcrf_scan.features.candidates import Candidates, with_targets
-from torchcrf_scan.features.lattice import lattice_features
 from torchcrf_scan.features.learned import association_extra, clustering_extra
 from torchcrf_scan.features.potentials import (
     AssociationStates,
-    Boosters,
     PairView,
     association_potentials,
     association_unary,
@@ -31,64 +28,18 @@ from torchcrf_scan.features.potentials import (
     possible_clusters,
     registered_points,
 )
-from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.lattice import lattice_beliefs
 from torchcrf_scan.inference.messages import chain_beliefs
 from torchcrf_scan.inference.motion import Motions, estimate, hard_support, retire_empty, soft_support, trim
-from torchcrf_scan.inference.selection import ClusterPotential, discard_vacuous
-from torchcrf_scan.inference.uncertainty import Calibration, motion_covariance
+from torchcrf_scan.inference.selection import discard_vacuous
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.state import Parameters, Round, State
+from torchcrf_scan.inference.uncertainty import motion_covariance
+from torchcrf_scan.prediction import Prediction
 
 MERGE_ROTATION = 0.01  # radians
 SELECTION_ROUNDS = 2  # that begin with the question which movers there are
 ROBUST_SHARE = 0.3  # of a point's usual residual: across a surface errors are smaller than from point to point
-
-
-@dataclass(frozen=True, slots=True)
-class Parameters:
-    """What was learned: weights (23,) and (20,), the features' scales and boosters, honest confidences, a mover's worth."""
-
-    association: Tensor
-    clustering: Tensor
-    scales: Scales
-    boosters: Boosters
-    calibration: Calibration = field(default_factory=Calibration)
-    potential: ClusterPotential = field(default_factory=ClusterPotential)
-
-
-@dataclass(frozen=True, slots=True)
-class State:
-    """One round's state of B pairs. Gradients reach the log-beliefs and, where soft, the motions; labels have none.
-
-    Attributes:
-        motions: motions and which clusters exist.
-        association: (B, N) hat x_a, target point or -1. cluster: (B, N) hat x_c, cluster or -1.
-        candidates: (B, N, K) inlier states of the association chain, candidate_mask: which are real.
-        log_association: (B, N, K+1), log_cluster: (B, N, D) log-beliefs.
-    """
-
-    motions: Motions
-    association: Tensor
-    cluster: Tensor
-    candidates: Tensor
-    candidate_mask: Tensor
-    log_association: Tensor
-    log_cluster: Tensor
-
-
-@dataclass(frozen=True, slots=True)
-class Round:
-    """What B pairs had come to after a round.
-
-    Attributes:
-        state: labels, beliefs and motions.
-        converged: (B,) bool, settled. iterations: (B,) rounds done.
-    """
-
-    state: State
-    converged: Tensor
-    iterations: Tensor
 
 
 def decode(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> Prediction:
@@ -171,6 +122,8 @@ def step(
     found = find_candidates(view, state.motions.value, state.motions.active, config)
     state = hold_motions(state, config)
     if coupling == "lattice":
+        from torchcrf_scan.variants.lattice import update_lattice
+
         state = update_lattice(view, start, state, found, parameters, config)
         state = update_motions(view, start, state, parameters, config)
         return replace(state, motions=retire_empty(state.motions, count_points(state)))
@@ -255,33 +208,6 @@ def association_labels(best: Tensor, candidates: Tensor, mask: Tensor) -> Tensor
     """(B, N) target point of the best state, -1 for the outlier and for padding. best: (B, N)."""
     padded = torch.cat([candidates, torch.full_like(candidates[..., :1], -1)], dim=-1)
     return padded.gather(-1, best[..., None])[..., 0].masked_fill(~mask, -1)
-
-
-def update_lattice(
-    view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig
-) -> State:
-    """An exact pass over the chain of super-nodes, which decides both labels of a point at once (spec 7.7)."""
-    batch, motions = view.batch, state.motions
-    states = AssociationStates.of(view, found.index, found.mask, parameters.scales, parameters.boosters)
-    possible = possible_clusters(motions.active, start.reach, batch.source.shape[1])
-    features = lattice_features(view, states, motions.value, found.nearest, possible, parameters.scales, parameters.boosters)
-    potentials = features.potentials(torch.cat([parameters.association, parameters.clustering]))
-    of_association, of_cluster = association_extra(view.learned, found.index), clustering_extra(view.learned, possible.shape[-1])
-    if of_association is not None:
-        potentials = replace(potentials, log_unary=potentials.log_unary + of_association[..., None])
-    if of_cluster is not None:
-        potentials = replace(potentials, log_unary=potentials.log_unary + of_cluster[:, :, None])
-    beliefs = lattice_beliefs(potentials, batch.source_mask, config.temperature)
-    place, cluster = beliefs.best()
-    return replace(
-        state,
-        association=association_labels(place, found.index, batch.source_mask),
-        cluster=cluster_labels(cluster, possible.shape[-1] - 1, batch.source_mask),
-        candidates=found.index,
-        candidate_mask=found.mask,
-        log_association=beliefs.log_association,
-        log_cluster=beliefs.log_cluster,
-    )
 
 
 def update_motions(

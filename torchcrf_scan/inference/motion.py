@@ -10,7 +10,6 @@ from torch import Tensor
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch, safe_atan2
-from torchcrf_scan.inference.registration import gauss_newton_step
 
 ALONG = 0.03  # share of a residual along the surface that a point-to-line step still feels
 KEPT_SHARE, TRIM_ROUNDS = 0.8, 3  # of trimmed Kabsch
@@ -216,3 +215,43 @@ class RunningSums:
         usable = (count > 0) & previous.active
         usable = torch.cat([large[:, :1], usable[:, 1:]], dim=1)
         return torch.where(usable[..., None], fitted, before).to(previous.value.dtype)
+
+
+TURN_DAMPING, SHIFT_DAMPING = 1e-4, 1e-3  # of a step, in shares of the lever's weight and of the weight
+
+LEAST_DAMPING = 1e-6  # of a turn about one spot, which has no lever
+
+LARGEST_TURN = 0.5  # radians in one step
+
+
+def gauss_newton_step(moved: Tensor, partner: Tensor, tangent: Tensor, weights: Tensor, along: float) -> Tensor:
+    """One least-squares step of a rigid motion, applied after the present one.
+
+    Minimises sum_i w_i (r^T (I - (1 - along) t t^T) r): point-to-point at along = 1, point-to-line at 0.
+
+    Args:
+        moved, partner, tangent: (..., P, 2); weights: (..., P).
+
+    Returns:
+        (..., 3); the identity where all weights are 0. Damped, so finite for any number of points.
+    """
+    residual = moved - partner
+    centre = (weights[..., None] * moved).sum(-2, keepdim=True) / weights.sum(-1)[..., None, None].clamp(min=1e-9)
+    arm = moved - centre
+    lever = torch.stack([-arm[..., 1], arm[..., 0]], dim=-1)  # d moved / d theta, turning about the weighted centre
+    slack = 1 - along
+
+    def dot_metric(a: Tensor, b: Tensor) -> Tensor:
+        return (a * b).sum(-1) - slack * (a * tangent).sum(-1) * (b * tangent).sum(-1)
+
+    axes = torch.eye(2, dtype=moved.dtype, device=moved.device)
+    basis = (lever, axes[0].expand_as(lever), axes[1].expand_as(lever))
+    total = weights.sum(-1).clamp(min=1e-9)
+    normal = torch.stack([torch.stack([(weights * dot_metric(a, b)).sum(-1) for b in basis], -1) for a in basis], -2)
+    right = torch.stack([-(weights * dot_metric(a, residual)).sum(-1) for a in basis], -1)
+    scale = (weights * (lever**2).sum(-1)).sum(-1)
+    damping = torch.stack([TURN_DAMPING * scale + LEAST_DAMPING * total, SHIFT_DAMPING * total, SHIFT_DAMPING * total], dim=-1)
+    step, _ = torch.linalg.solve_ex(normal + torch.diag_embed(damping), right)  # damped, so there is no failure to look for
+    theta, shift = step[..., 0].clamp(-LARGEST_TURN, LARGEST_TURN), step[..., 1:]
+    pivot = centre[..., 0, :]
+    return torch.cat([theta[..., None], pivot - se2.rotate(theta, pivot) + shift], dim=-1)

@@ -31,8 +31,8 @@ from torchcrf_scan.features.potentials import (
     state_mask,
 )
 from torchcrf_scan.features.scales import Scales
-from torchcrf_scan.inference.joint import Parameters
 from torchcrf_scan.inference.messages import log_partition
+from torchcrf_scan.inference.state import Parameters
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,8 @@ from torchcrf_scan.features.potentials import PairView, clustering_potentials, c
 from torchcrf_scan.inference.messages import log_partition, silence_padding
 
 if TYPE_CHECKING:
-    from torchcrf_scan.inference.initialise import Start
-    from torchcrf_scan.inference.joint import Parameters, State
+    from torchcrf_scan.inference.start import Start
+    from torchcrf_scan.inference.state import Parameters, State
 
 CAPPED = 5.0  # log-odds; a hypothesis is never surer than this
 

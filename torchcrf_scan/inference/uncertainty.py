@@ -8,7 +8,7 @@ corridor every noisy tangent seems to hold the motion back. Surfaces are therefo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -17,9 +17,8 @@ from torch import Tensor, nn
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import safe_atan2
 from torchcrf_scan.inference.motion import Support
-from torchcrf_scan.tree import tensor_tree
+from torchcrf_scan.prediction import LEAST_SHARE, Uncertainty
 
-LEAST_SHARE = 0.02  # of the best possible information per point; in a direction with less the motion counts as not observed
 STRETCH, STEPS = 10.0, 2.0  # a surface's direction comes from the points within so many noises and steps to the next point
 NEIGHBOURS = 8  # on either side, at most
 RUN = 48  # neighbouring points whose errors may go together: a jolt lasts several degrees
@@ -27,60 +26,6 @@ NOTHING = 1e-3  # of what a point says, so that no matrix is singular
 TINY = 1e-6  # of the scene's reach: the least noise
 MOST_CERTAIN = -50.0  # log-beliefs below this are as good as impossible
 WITHIN = 2  # target points; an association this near is the same answer, since annotations err by one themselves
-
-
-@tensor_tree
-@dataclass(frozen=True, slots=True)
-class Uncertainty:
-    """How well the motions of a batch are known.
-
-    A small motion away from cluster c's own is (theta L, x, y): a turn about the centroid of its moved points, times their root
-    mean square distance L from it, then a shift in the target frame; all in metres. `directions` are given in these.
-
-    Attributes:
-        covariance: (B, C, 3, 3) of (theta, tx, ty), radians and metres; large but finite where nothing is observed.
-        information: (B, C, 3) ascending, what a point says of each of the `directions`, 1 = as much as a point can say of a shift.
-            No gradient.
-        directions: (B, C, 3, 3), row d is the unit direction of information[..., d]. No gradient.
-    """
-
-    covariance: Tensor
-    information: Tensor
-    directions: Tensor
-
-    @property
-    def degenerate(self) -> Tensor:
-        """(B, C, 3) bool, the directions in which the motion is not observed."""
-        return self.information < LEAST_SHARE
-
-    @property
-    def is_turn_unobserved(self) -> Tensor:
-        """(B, C) bool, whether nothing is known of the rotation: no points, one point, a pole, a tube seen from its middle."""
-        return self._unobserved[..., 0, 0] > 0.5
-
-    @property
-    def unobserved_shift(self) -> Tensor:
-        """(B, C, 2) unit vector, in the target frame, along which the cluster may have slid unseen (a corridor's, a car's side).
-
-        0 where there is none; where no shift is observed at all, any of the directions.
-        """
-        values, vectors = torch.linalg.eigh(self._unobserved[..., 1:, 1:])
-        return vectors[..., -1] * (values[..., -1:] > 0.5)
-
-    @property
-    def _unobserved(self) -> Tensor:
-        """(B, C, 3, 3) projection onto the degenerate directions."""
-        rows = self.directions * self.degenerate[..., None]
-        return rows.mT @ rows
-
-    def scaled(self, factor: Tensor) -> Uncertainty:
-        """The same in another unit of length, a factor (B,) a pair."""
-        unit = torch.stack([torch.ones_like(factor), factor, factor], -1)[:, None]  # (B, 1, 3)
-        return replace(self, covariance=self.covariance * unit[..., None] * unit[..., None, :])
-
-    def inflated(self, factor: Tensor) -> Uncertainty:
-        """All covariances times a factor ()."""
-        return replace(self, covariance=self.covariance * factor)
 
 
 def motion_covariance(

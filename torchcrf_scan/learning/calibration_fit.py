@@ -12,11 +12,12 @@ from scipy.optimize import minimize
 from scipy.special import expit
 from scipy.stats import chi2
 
-from torchcrf_scan.batch import Prediction, ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.evaluation.calibration import MOTION_FREEDOM, background_nees, rightness
 from torchcrf_scan.inference.uncertainty import WITHIN, Calibration, association_log_odds, cluster_log_odds
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import Bools, Floats, ScanPair
 
 DOMINATED = 1 / 3  # share of a scan's known points that move, from which on movers dominate it

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from torchcrf_scan.baselines.cascade import Cascade
-from torchcrf_scan.config import Config, EncoderConfig
+from torchcrf_scan.config import EncoderConfig
 from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.material import Material
+from torchcrf_scan.learning.settings import Config
 from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import ClusteringCRF, MatchingCRF
 

@@ -12,20 +12,20 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcrf_scan.config import LearningConfig
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS, live_weights
 from torchcrf_scan.inference import joint, pseudo_likelihood
-from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.lattice_likelihood import lattice_chain
 from torchcrf_scan.inference.pseudo_likelihood import Chain, PlugIns
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.boosting_fit import fit_boosters
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.scales_fit import fit_scales
 from torchcrf_scan.learning.selection_fit import fit_potential
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.learning.weights_fit import Watch, fit_chain
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.variants.lattice_likelihood import lattice_chain
 
 Margins = dict[int, Boosters]  # by out-of-fold part, boosters that have not seen it
 

@@ -17,13 +17,13 @@ import torch
 from torch import Tensor
 from torch.optim import AdamW
 
-from torchcrf_scan.config import Config, GradientConfig
-from torchcrf_scan.data.stream import PairStream, Parts
 from torchcrf_scan.learning.checkpoint import Store, set_random_state
 from torchcrf_scan.learning.objectives import Objective, known_nodes, make_objective
 from torchcrf_scan.learning.portions import Collate, Portion, load_portions
 from torchcrf_scan.learning.ranks import Ranks
 from torchcrf_scan.learning.schedule import EarlyStopping, make_schedule
+from torchcrf_scan.learning.settings import Config, GradientConfig
+from torchcrf_scan.learning.stream import PairStream, Parts
 from torchcrf_scan.learning.validation import Answers, Validation
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
@@ -181,9 +181,9 @@ def train_by_gradient(
         parts = f"{gradient.batch_size} / {gradient.part}"
         raise ValueError(f"gradient.part: expected {parts} parts to be shared out among {ranks.world} processes, got a remainder")
     objective = make_objective(config)
-    needs_start, backend = config.first_order != "pseudo_likelihood", model.config.inference.backend
+    needs_start = config.first_order != "pseudo_likelihood"
     learner = Learner(model, gradient, ranks)
-    validation = Validation.of(held_out, gradient.part, ranks, model.config.inference.backend)
+    validation = Validation.of(held_out, gradient.part, ranks)
 
     def look() -> None:
         if not held_out:
@@ -207,7 +207,7 @@ def train_by_gradient(
         learner.load_state_dict(state)
         set_random_state(state["random"])
     parts_left = Parts(gradient.batch_size, gradient.part, learner.step, gradient.steps, ranks.rank, ranks.world)
-    collate = Collate(config.learning.disturbance, gradient.seed, needs_start, backend)
+    collate = Collate(config.learning.disturbance, gradient.seed, needs_start)
     portions = load_portions(PairStream(gradient, pairs), parts_left, collate, gradient.workers)
     while learner.step < gradient.steps and not learner.stopping.is_over:
         report = learner.descend(objective, portions)

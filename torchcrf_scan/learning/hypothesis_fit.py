@@ -11,16 +11,18 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import SimulatorConfig
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.background import background_pool, unit_length
-from torchcrf_scan.inference.hypotheses import Hypotheses, hypothesise, point_units
-from torchcrf_scan.inference.hypothesis_features import FEATURES, hypothesis_features
-from torchcrf_scan.inference.movers import HypothesisScore, select
-from torchcrf_scan.inference.surface import Surface
 from torchcrf_scan.learning.disturb import bump, skew
-from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.loops.pair import Pair, array_of, pair_of
+from torchcrf_scan.scan import Bools, Floats, Ints, ScanPair
+from torchcrf_scan.search.accept import probabilities_of, score_of, select
+from torchcrf_scan.search.background import unit_length
+from torchcrf_scan.search.hypotheses import members_of
+from torchcrf_scan.search.pool import background_pool
+from torchcrf_scan.search.score import FEATURES, HypothesisScore
+from torchcrf_scan.search.survey import Survey, grids_of, survey_at
 
 log = logging.getLogger(__name__)
 
@@ -51,20 +53,21 @@ MIXTURE = (  # share and world
 
 @dataclass(frozen=True, slots=True)
 class HypothesisView:
-    """One pair as the fit sees it: its surfaces, a background, the hypotheses, their features (H, F) and labels.
+    """One annotated pair as the fit sees it: what a background leaves, the hypotheses with their features, and which are right.
 
     Attributes:
-        body: (P,) true mover of every source point, motions: (K+1, 3) true motions.
+        survey: of the disturbed pair at a background that may be found.
         label: (H,) 1 right, 0 wrong, -1 neither.
+        body: (P,) true mover of every source point.
     """
 
-    source: Surface
-    target: Surface
-    hypotheses: Hypotheses
-    features: Tensor
-    label: Tensor
-    body: Tensor
-    motions: Tensor
+    survey: Survey
+    label: Ints
+    body: Ints
+
+    def members(self, which: Ints) -> Bools:
+        """(G, P) the source points that the hypotheses (G,) move."""
+        return members_of(self.survey.hypotheses, which, len(self.body))
 
 
 def simulate_mixture(count: int, seed: int) -> list[ScanPair]:
@@ -83,7 +86,7 @@ def fit_mixture(count: int = 110, seed: int = 0) -> HypothesisScore:
 
 
 def view_pair(pair: ScanPair, seed: int, views: int = VIEWS) -> list[HypothesisView]:
-    """The annotated pair seen `views` times with other noise, beams and background error. Takes about 0.15 s a view."""
+    """The annotated pair seen `views` times with other noise, beams and background error."""
     generator = torch.Generator().manual_seed(seed)
     return [view for _ in range(views) if (view := _view(pair, generator)) is not None]
 
@@ -94,12 +97,12 @@ def fit_hypothesis_score(seen: Sequence[HypothesisView]) -> HypothesisScore:
     Returns:
         The fitted score, or the default one where the pairs hold no mover, or nothing else.
     """
-    features = torch.cat([view.features for view in seen]) if seen else torch.zeros(0, len(FEATURES))
-    label = torch.cat([view.label for view in seen]) if seen else torch.zeros(0)
+    features = np.concatenate([np.zeros((0, len(FEATURES))), *(view.survey.features for view in seen)])
+    label = np.concatenate([np.zeros(0, np.int64), *(view.label for view in seen)])
     if not ((label == 0).any() and (label == 1).any()):
         log.warning("no hypotheses of one kind to learn from: keeping the default score of movers")
         return HypothesisScore()
-    score = fit_logistic(features[label >= 0], label[label >= 0])
+    score = fit_logistic(torch.from_numpy(features[label >= 0]).float(), torch.from_numpy(label[label >= 0]))
     score.threshold.fill_(_best_threshold(score, seen))
     return score
 
@@ -120,68 +123,73 @@ def fit_logistic(features: Tensor, label: Tensor) -> HypothesisScore:
 def _view(pair: ScanPair, generator: torch.Generator) -> HypothesisView | None:
     """The pair disturbed as real recordings are; None where a scan is left without points."""
     assert pair.annotation is not None
-    batch = ScanPairBatch.collate([pair])
+    whole = pair_of(ScanPairBatch.collate([pair]), 0)
     kept = _thin(len(pair.source), generator), _thin(len(pair.target), generator)
     if min(len(k) for k in kept) < 2:
         return None
-    noise = batch.range_noise[0]
-    source = Surface.of(batch.source[0][kept[0]], noise, pair.source.is_closed)
-    target = Surface.of(batch.target[0][kept[1]], noise, pair.target.is_closed)
-    unit = unit_length(source, target)
-    points = skew(source.points[None], torch.ones(1, len(source), dtype=torch.bool), SKEW * unit[None], generator)
-    source = Surface.of(bump(points, BUMP * unit[None], generator)[0], noise, pair.source.is_closed)
-    motions = torch.from_numpy(pair.annotation.motions).to(source.points)
+    thin = whole._replace(source=whole.source[kept[0]], target=whole.target[kept[1]])
+    source, target = grids_of(thin)
+    unit = unit_length(source.scan, target.scan)
+    source, _ = grids_of(thin._replace(source=_disturb(thin, unit, generator)))
+    motions = pair.annotation.motions
     known = np.where(pair.annotation.ignore, IGNORED, pair.annotation.body)
-    body = torch.from_numpy(known[pair.source.beam])[kept[0]]
-    background = _background(source, target, motions[0], unit, generator)
-    hypotheses = hypothesise(source, target, background, pair.dt)
-    features = hypothesis_features(hypotheses, source, target, background)
-    label = label_hypotheses(hypotheses, source, body, motions, unit)
-    return HypothesisView(source, target, hypotheses, features, label, body, motions)
+    body = known[pair.source.beam][kept[0]]
+    error = BACKGROUND_ERROR * unit * torch.randn(3, generator=generator).double().numpy()
+    error[0] /= np.median(source.scan.ranges)
+    if torch.rand((), generator=generator) < FOUND_SHARE:
+        background = background_pool(source, target, motions[0], np.zeros((0, 3)))[0]
+    else:
+        background = array_of(se2.compose(torch.from_numpy(error), torch.from_numpy(motions[0])))
+    survey = survey_at(source, target, background, pair.dt)
+    every = np.arange(len(survey.hypotheses.motions))
+    members = members_of(survey.hypotheses, every, len(body))
+    return HypothesisView(survey, label_hypotheses(survey, members, body, motions), body)
 
 
-def _thin(count: int, generator: torch.Generator) -> Tensor:
+def _disturb(pair: Pair, unit: float, generator: torch.Generator) -> Floats:
+    """(P, 2) the source as a sensor sees it that moves and tilts. unit: metres."""
+    points, metres = torch.from_numpy(pair.source)[None], torch.tensor([unit], dtype=torch.float64)
+    skewed = skew(points, torch.ones(points.shape[:2], dtype=torch.bool), SKEW * metres, generator)
+    return array_of(bump(skewed, BUMP * metres, generator)[0])
+
+
+def _thin(count: int, generator: torch.Generator) -> Ints:
     """Index of the beams that are kept; every other time all are."""
     share = torch.empty(()).uniform_(*KEPT_BEAMS, generator=generator)
     share = torch.where(torch.rand((), generator=generator) < 0.5, share, torch.ones(()))
-    return (torch.rand(count, generator=generator) < share).nonzero()[:, 0]
+    return (torch.rand(count, generator=generator) < share).nonzero()[:, 0].numpy()
 
 
-def _background(source: Surface, target: Surface, truth: Tensor, unit: Tensor, generator: torch.Generator) -> Tensor:
-    """(3,) the background's motion as it may be found."""
-    error = BACKGROUND_ERROR * unit * torch.randn(3, generator=generator)
-    error = torch.cat([error[:1] / source.ranges.median(), error[1:]])
-    if torch.rand((), generator=generator) < FOUND_SHARE:
-        return background_pool(source, target, truth)[0]
-    return se2.compose(error, truth)
-
-
-def label_hypotheses(hypotheses: Hypotheses, source: Surface, body: Tensor, motions: Tensor, unit: Tensor) -> Tensor:
+def label_hypotheses(survey: Survey, members: Bools, body: Ints, motions: Floats) -> Ints:
     """(H,) 1: moves mostly one true mover, and as it moved; 0: neither; -1: between, a mover that hardly moved, or not annotated.
 
     Args:
+        members: (H, P) source points that every hypothesis moves.
         body: (P,) true cluster of every point, -1 none, `IGNORED`. motions: (K+1, 3) of every cluster, NaN where unknown.
-        unit: () metres.
     """
-    if not len(hypotheses):
-        return torch.zeros(0, dtype=torch.int64)
-    count = torch.stack([(hypotheses.members & (body == k)).sum(-1) for k in range(len(motions))], dim=-1)  # (H, K+1)
-    most, which = count.max(-1)
-    pure = most / hypotheses.members.sum(-1)
-    error = _apart(hypotheses.motions, motions[which], source.points, hypotheses.members)
-    travel = _apart(motions[:1].expand(len(which), -1), motions[which], source.points, hypotheses.members)
-    local = (hypotheses.members * point_units(source)).sum(-1) / hypotheses.members.sum(-1)  # far away, points tell less
-    tolerance = torch.maximum(TOLERANCE * torch.maximum(local, unit), TOLERANCE_SHARE * travel)
-    right = (pure >= PURE) & (which > 0) & (travel > unit) & (error < tolerance)
-    between = (pure >= 0.5) & (which > 0) & (error < 1.5 * tolerance) & (travel > 0.5 * unit)
-    between |= error.isnan() | ((hypotheses.members & (body == IGNORED)).sum(-1) > hypotheses.members.sum(-1) / 2)
-    return torch.where(between & ~right, -1, right.long())
+    leftover, found = survey.leftover, survey.hypotheses.motions
+    if not len(found):
+        return np.zeros(0, np.int64)
+    points, unit, count = leftover.source.grid.scan.points, leftover.unit, members.sum(-1)
+    of_body = np.stack([(members & (body == k)).sum(-1) for k in range(len(motions))], axis=-1)  # (H, K+1)
+    which = of_body.argmax(-1)
+    pure = of_body.max(-1) / count
+    error = _apart(found, motions[which], points, members)
+    travel = _apart(np.broadcast_to(motions[0], found.shape), motions[which], points, members)
+    local = (members * leftover.source.units).sum(-1) / count  # far away, points tell less
+    with np.errstate(invalid="ignore"):  # NaN where a motion is unknown: no comparison with it holds
+        tolerance = np.maximum(TOLERANCE * np.maximum(local, unit), TOLERANCE_SHARE * travel)
+        right = (pure >= PURE) & (which > 0) & (travel > unit) & (error < tolerance)
+        between = (pure >= 0.5) & (which > 0) & (error < 1.5 * tolerance) & (travel > 0.5 * unit)
+    between |= np.isnan(error) | ((members & (body == IGNORED)).sum(-1) > count / 2)
+    return np.where(between & ~right, -1, right.astype(np.int64))
 
 
-def _apart(one: Tensor, other: Tensor, points: Tensor, members: Tensor) -> Tensor:
+def _apart(one: Floats, other: Floats, points: Floats, members: Bools) -> Floats:
     """(H,) mean distance of the members carried by two motions (H, 3) each."""
-    gap = torch.linalg.vector_norm(se2.apply(one, points) - se2.apply(other, points), dim=-1)
-    return (gap * members).sum(-1) / members.sum(-1)
+    here, there = (se2.apply(torch.tensor(motions), torch.from_numpy(points)).numpy() for motions in (one, other))  # (H, P, 2)
+    gap = np.linalg.norm(here - there, axis=-1)
+    return np.where(members, gap, 0.0).sum(-1) / members.sum(-1)
 
 
 def _best_threshold(score: HypothesisScore, views: Sequence[HypothesisView]) -> float:
@@ -196,18 +204,19 @@ def _count_accepted(score: HypothesisScore, view: HypothesisView) -> list[tuple[
 
     The choice is greedy, so a higher threshold accepts the first of those that a lower one accepts.
     """
-    findable = len(_bodies(view, view.hypotheses.members[view.label == 1]))
-    probabilities = score(view.features)
-    movers = select(view.hypotheses, probabilities, view.source, view.target, threshold=THRESHOLDS[0], most=MOST_MOVERS)
-    chosen = Hypotheses(movers.motions, movers.members)
-    label = label_hypotheses(chosen, view.source, view.body, view.motions, unit_length(view.source, view.target))
+    survey = view.survey
+    findable = len(_bodies(view, np.flatnonzero(view.label == 1)))
+    probabilities = probabilities_of(score_of(score), survey.features)
+    chosen = select(survey.leftover, survey.hypotheses, probabilities, THRESHOLDS[0], MOST_MOVERS)
     rows = []
     for threshold in THRESHOLDS:
-        is_sure = movers.probabilities >= threshold
-        found = _bodies(view, movers.members[is_sure & (label == 1)])
-        rows.append((len(found), int((is_sure & (label >= 0)).sum()), findable))
+        sure = chosen[probabilities[chosen] >= threshold]
+        found = _bodies(view, sure[view.label[sure] == 1])
+        rows.append((len(found), int((view.label[sure] >= 0).sum()), findable))
     return rows
 
 
-def _bodies(view: HypothesisView, members: Tensor) -> set[int]:
-    return {int(view.body[row].mode().values) for row in members}
+def _bodies(view: HypothesisView, which: Ints) -> set[int]:
+    """The movers that most members of each of the hypotheses (G,) belong to."""
+    values = (np.unique(view.body[row], return_counts=True) for row in view.members(which))
+    return {int(bodies[counts.argmax()]) for bodies, counts in values}

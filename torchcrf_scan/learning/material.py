@@ -10,13 +10,15 @@ from joblib import Parallel, delayed
 from tqdm import tqdm
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import LearningConfig
-from torchcrf_scan.inference.initialise import Start, Survey, choose
-from torchcrf_scan.inference.movers import HypothesisScore
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.disturb import disturb
 from torchcrf_scan.learning.hypothesis_fit import HypothesisView, fit_hypothesis_score, view_pair
-from torchcrf_scan.learning.portions import look
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.search.accept import score_of
+from torchcrf_scan.search.pairs import choose, survey
+from torchcrf_scan.search.score import HypothesisScore
+from torchcrf_scan.search.survey import Survey
 
 PART = 4  # pairs that one job looks at
 
@@ -75,15 +77,13 @@ class Collection:
             for begin in range(0, len(part), config.batch_size):
                 rows = part[begin : begin + config.batch_size]
                 batch = self.batch.select(torch.tensor(rows))
-                start = choose(batch, [self.surveys[k] for k in rows], score, clusters)
+                start = choose(batch, [self.surveys[k] for k in rows], score_of(score), clusters)
                 material.append(Material(batch, start, fold, tuple(self.pairs[k] for k in rows)))
         return material
 
 
-def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1, backend: str = "auto") -> Collection:
+def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) -> Collection:
     """Looks at the pairs, on `jobs` cores (-1: all); what is drawn at random for a pair does not depend on `jobs`.
-
-    backend: what searches for motions, see `InferenceConfig`.
 
     Raises:
         ValueError: a pair without annotation, or no pair.
@@ -96,7 +96,7 @@ def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1, ba
         batch = disturb(batch, config.disturbance, torch.Generator().manual_seed(config.seed))
     parts = [range(k, min(k + PART, len(pairs))) for k in range(0, len(pairs), PART)]
     tasks = (
-        delayed(_look)(batch.select(torch.tensor(part)), [pairs[k] for k in part], [config.seed + k for k in part], backend)
+        delayed(_look)(batch.select(torch.tensor(part)), [pairs[k] for k in part], [config.seed + k for k in part])
         for part in parts
     )
     found = Parallel(n_jobs=jobs, return_as="generator")(tasks)
@@ -109,9 +109,9 @@ def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1, ba
 
 
 def _look(
-    batch: ScanPairBatch, pairs: Sequence[ScanPair], seeds: Sequence[int], backend: str
+    batch: ScanPairBatch, pairs: Sequence[ScanPair], seeds: Sequence[int]
 ) -> tuple[list[Survey | None], list[list[HypothesisView]]]:
-    return look(batch, backend), [view_pair(pair, seed) for pair, seed in zip(pairs, seeds, strict=True)]
+    return survey(batch), [view_pair(pair, seed) for pair, seed in zip(pairs, seeds, strict=True)]
 
 
 def assign_folds(sequences: Sequence[str], folds: int) -> list[int]:

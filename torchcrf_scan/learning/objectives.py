@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import fields
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import Config, LearningConfig
 from torchcrf_scan.inference import pseudo_likelihood as features
-from torchcrf_scan.inference.initialise import Start, choose
-from torchcrf_scan.inference.lattice_likelihood import LatticeChain, lattice_chain
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.portions import Portion
+from torchcrf_scan.learning.settings import Config, LearningConfig
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.search.accept import score_of
+from torchcrf_scan.search.pairs import choose
+from torchcrf_scan.variants.lattice_likelihood import LatticeChain, lattice_chain
 
 Objective = Callable[[JointScanCRF, Portion], dict[str, Tensor]]
 
@@ -82,25 +81,12 @@ def labelled_chains(
         yield "cluster", features.clustering_chain(view, plugins, fitted.scales), fitted.clustering
 
 
-@torch.no_grad()
 def start_of(model: JointScanCRF, portion: Portion) -> Start:
     """The motions to begin with, from what was surveyed, or looked for now."""
     if not portion.surveys:
         return model.initialise(portion.batch)
-    with torch.autocast("cpu", enabled=False):  # that is where surveys are looked at
-        return _choose(model, portion)
-
-
-def _choose(model: JointScanCRF, portion: Portion) -> Start:
-    """The motions to begin with, on the batch's device."""
     clusters = 1 if model.config.chains == "matching" else model.config.inference.clusters - 1
-    device = portion.batch.source.device
-    if device.type == "cpu":
-        return choose(portion.batch, portion.surveys, model.hypothesis_score, clusters)
-    found = choose(portion.batch.to("cpu"), portion.surveys, copy.deepcopy(model.hypothesis_score).cpu(), clusters)
-    moved: dict[str, Any] = {f.name: getattr(found, f.name) for f in fields(found)}
-    moved = {name: None if value is None else value.to(device) for name, value in moved.items()}
-    return Start(**moved)
+    return choose(portion.batch, portion.surveys, score_of(model.hypothesis_score), clusters)
 
 
 def make_objective(config: Config) -> Objective:

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import LearningConfig
 from torchcrf_scan.features.potentials import resolution
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.initialise import Start, within_reach
 from torchcrf_scan.inference.pseudo_likelihood import PlugIns, true_plugins
+from torchcrf_scan.inference.start import Start, within_reach
+from torchcrf_scan.learning.settings import LearningConfig
 
 
 def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig, generator: torch.Generator) -> PlugIns:

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader
 
-from torchcrf_scan.backend import can_search
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.data.stream import PairStream, Parts, Sample, seed_of
-from torchcrf_scan.inference.initialise import Survey, survey
 from torchcrf_scan.learning.disturb import disturb
+from torchcrf_scan.learning.stream import PairStream, Parts, Sample, seed_of
 from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.search.pairs import survey
+from torchcrf_scan.search.survey import Survey
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +42,12 @@ class Collate:
     """Makes a batch of samples, in the worker: frames displaced, scans disturbed, surveyed where the loss needs a start.
 
     Attributes:
-        disturbance: see `learning.disturbance`. seed: of all that is drawn. surveys: whether to look for motions, and what
-            `backend` does.
+        disturbance: see `learning.disturbance`. seed: of all that is drawn. surveys: whether to look for motions.
     """
 
     disturbance: float = 0.0
     seed: int = 0
     surveys: bool = False
-    backend: str = "auto"
 
     def __call__(self, samples: Sequence[Sample]) -> Portion:
         """The portion of the samples, of which the first one's index decides how they are disturbed."""
@@ -59,17 +57,8 @@ class Collate:
         if self.disturbance > 0:
             generator = torch.Generator().manual_seed(seed_of(self.seed, samples[0].index, 2))
             batch = disturb(batch, self.disturbance, generator)
-        surveys = tuple(look(batch, self.backend)) if self.surveys else ()
+        surveys = tuple(survey(batch)) if self.surveys else ()
         return Portion(batch, surveys, seed_of(self.seed, samples[0].index, 3))
-
-
-def look(batch: ScanPairBatch, backend: str = "auto") -> list[Survey | None]:
-    """What InitialiseRT looks at in every pair. backend: what searches for motions, see `InferenceConfig`."""
-    if can_search(backend, batch.source):
-        from torchcrf_scan.compiled import pair
-
-        return pair.survey(batch)
-    return survey(batch)
 
 
 def load_portions(stream: PairStream, parts: Parts, collate: Collate, workers: int) -> Iterator[Portion]:
@@ -103,7 +92,7 @@ def leave_with(parent: int) -> None:
     os._exit(1)
 
 
-def as_portion(pairs: Sequence[ScanPair], backend: str = "auto") -> Portion:
+def as_portion(pairs: Sequence[ScanPair]) -> Portion:
     """Pairs as they are, surveyed."""
     batch = ScanPairBatch.collate(pairs)
-    return Portion(batch, tuple(look(batch, backend)))
+    return Portion(batch, tuple(survey(batch)))

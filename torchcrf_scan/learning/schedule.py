@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from torchcrf_scan.config import GradientConfig
+from torchcrf_scan.learning.settings import GradientConfig
 
 
 def rate_at(step: int, config: GradientConfig) -> float:

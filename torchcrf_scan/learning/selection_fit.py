@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchcrf_scan.features.potentials import PairView, find_candidates
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.initialise import Start
 from torchcrf_scan.inference.selection import ClusterPotential, evidence
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.model import JointScanCRF
 

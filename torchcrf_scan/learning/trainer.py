@@ -19,27 +19,29 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcrf_scan.baselines.cascade import Cascade
-from torchcrf_scan.batch import Prediction, ScanPairBatch
-from torchcrf_scan.config import WORLDS, AugmentConfig, Config, DataConfig
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.dataset import PairFiles, split_by_sequence
 from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import Table, report
 from torchcrf_scan.evaluation.summary import summarise
-from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.cascade_fit import fit_cascade
 from torchcrf_scan.learning.checkpoint import Store, load_weights, write_bytes
 from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.material import Material, collect
+from torchcrf_scan.learning.monitor import TrainingMonitor
 from torchcrf_scan.learning.ranks import ALONE, Ranks, join
+from torchcrf_scan.learning.run_log import RunLog
 from torchcrf_scan.learning.selection_fit import fit_potential
+from torchcrf_scan.learning.settings import AugmentConfig, Config, DataConfig
 from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import PairPrediction, ScanPair
-from torchcrf_scan.viz.monitor import TrainingMonitor
-from torchcrf_scan.viz.tensorboard import RunLog
 
 log = logging.getLogger(__name__)
 
@@ -132,7 +134,7 @@ def prepare(
     model: JointScanCRF, pairs: Sequence[ScanPair], config: Config, run: RunLog, state: dict[str, Any] | None
 ) -> list[Material]:
     """Material from the pairs, and the model as training finds it: fitted in stages, from `config.init`, or from a checkpoint."""
-    collection = collect(pairs, config.learning, jobs=-1, backend=config.model.inference.backend)
+    collection = collect(pairs, config.learning, jobs=-1)
     everything = range(len(collection))
     if state is not None:
         model.load_state_dict(state["best"] or state["model"])

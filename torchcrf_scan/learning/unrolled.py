@@ -20,11 +20,12 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
-from torchcrf_scan.config import ModelConfig, UnrolledConfig
+from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.initialise import Start
-from torchcrf_scan.inference.joint import State
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.state import State
+from torchcrf_scan.learning.settings import UnrolledConfig
 from torchcrf_scan.model import JointScanCRF
 
 LEAST_LIKENESS = 0.5  # of a predicted mover that stands for a true one: half of its points, or a motion just within the tolerance

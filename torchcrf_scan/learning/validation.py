@@ -12,7 +12,7 @@ from torch import nn
 from torchcrf_scan.baselines.ransac import match_ransac
 from torchcrf_scan.baselines.start import label_nearest
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.inference.initialise import Start
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.objectives import Objective, known_nodes, start_of
 from torchcrf_scan.learning.portions import Portion, as_portion
 from torchcrf_scan.learning.ranks import Ranks
@@ -49,11 +49,11 @@ class Validation:
     rivals: dict[int, PairPrediction]
 
     @classmethod
-    def of(cls, pairs: Sequence[ScanPair], part: int, ranks: Ranks, backend: str = "auto") -> Validation:
+    def of(cls, pairs: Sequence[ScanPair], part: int, ranks: Ranks) -> Validation:
         """Looks at this process's parts of the pairs, `part` pairs each."""
         parts = [tuple(range(k, min(k + part, len(pairs)))) for k in range(0, len(pairs), part)][ranks.rank :: ranks.world]
         rivals = {k: match_ransac(pairs[k]) for places in parts for k in places}  # once: it learns nothing
-        portions = tuple(as_portion([pairs[k] for k in places], backend) for places in parts)
+        portions = tuple(as_portion([pairs[k] for k in places]) for places in parts)
         return cls(tuple(pairs), tuple(parts), portions, rivals)
 
     @torch.no_grad()

@@ -11,9 +11,9 @@ import torch
 from scipy.optimize import OptimizeResult, minimize
 from torch import Tensor
 
-from torchcrf_scan.config import LearningConfig
-from torchcrf_scan.inference.lattice_likelihood import LatticeChain
 from torchcrf_scan.inference.pseudo_likelihood import Chain, Design
+from torchcrf_scan.learning.settings import LearningConfig
+from torchcrf_scan.variants.lattice_likelihood import LatticeChain
 
 AnyChain = TypeVar("AnyChain", Chain, LatticeChain)
 Watch = Callable[[int, float, float, Tensor], None]

@@ -1,0 +1,246 @@
+"""The paper's experiment: leave-one-out over annotated pairs, tables with intervals, figures, and ablations (spec 6.6, 8, 9)."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
+from torchcrf_scan.data.dataset import PairFiles
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.evaluation.bootstrap import by_blocks, by_sequence
+from torchcrf_scan.evaluation.metrics import PairScore, score_pair
+from torchcrf_scan.evaluation.report import Scores, Table, differences_table, report
+from torchcrf_scan.evaluation.summary import summarise
+from torchcrf_scan.experiment.ablation import ablation_table
+from torchcrf_scan.experiment.cross_validation import Results, cores, file_name, make_folds, rank_and_world, read_folds, run_folds
+from torchcrf_scan.experiment.methods import ENCODED, EXACT, JOINT, Study
+from torchcrf_scan.learning.run_log import RunLog
+from torchcrf_scan.learning.settings import Config
+from torchcrf_scan.scan import Ints, PairPrediction, ScanPair
+from torchcrf_scan.viz.plots import plot_associations, plot_clusters, save_figure
+
+log = logging.getLogger(__name__)
+
+SETTINGS = "experiment.json"
+ALSO_TRAIN_SEED = 5_000  # of the worlds that every fold trains on, far from those that are left out
+ASSOCIATION_FIGURE = ("ICP, tuned", "CRF-Matching", "start + gated NN", JOINT)  # the paper's Fig. 3, and the start
+CLUSTER_FIGURE = ("K-Means (ICP)", "K-Means (CRF-Matching)", "CRF-Clustering", JOINT)  # the paper's Fig. 4
+RIVAL = "start + gated NN"
+DRAWN = 3  # sequences whose first pair is drawn where none is asked for
+LOSSES = 3  # pictures of the pairs where the joint model loses most against the rival
+ABLATED = "leave_one_sequence_out"
+
+
+def run_experiment(config: Config) -> dict[str, list[Table]]:
+    """Runs the folds that the output folder lacks, then makes every table and figure.
+
+    Returns:
+        The tables of every protocol; none on the ranks of `torchrun` that only help.
+
+    Raises:
+        ValueError: nothing to leave out, an unknown pair to draw, or a folder of another experiment.
+    """
+    folder = Path(config.output)
+    pairs, tested = load_pairs(config)
+    figures = find_pairs(config.experiment.figures, pairs[:tested])
+    folds = {
+        protocol: make_folds(protocol, pairs, tested, config.experiment.test_every) for protocol in config.experiment.protocols
+    }
+    claim(folder, config, pairs)
+    for name in sorted(set(LIBRARIES) - set(installed_libraries())):
+        log.info("row left out, not installed: %s (pip install torchcrf-scan[bench])", name)
+    run_folds(lambda jobs: Study.of(pairs, config, jobs), folds, config, folder / "folds", cores(config.experiment.jobs))
+    if rank_and_world()[0] != 0:
+        return {}
+    tables = {}
+    with RunLog(folder) as run:
+        for protocol, of_protocol in folds.items():
+            results = read_folds(folder / "folds" / protocol, pairs, of_protocol)
+            scores = score(results)
+            tables[protocol] = tabulate(scores, results.seconds, protocol, config, run)
+            write_tables(folder / "tables", protocol, tables[protocol])
+            draw(results, scores, figures, folder / "figures" / protocol, run)
+    return tables
+
+
+def run_ablations(config: Config, variants: Mapping[str, Config]) -> list[Table]:
+    """The joint model under every variant of `config`, sequences left out in turn, beside the model of `config` itself.
+
+    variants: name -> its config. Returns one table; none on the ranks that only help. Raises ValueError as `run_experiment`.
+    """
+    folder = Path(config.output) / "ablations"
+    studies: dict[str, Study] = {}
+    scores, seconds, jobs = {}, {}, cores(config.experiment.jobs)
+    pairs, tested = load_pairs(config)
+    for name, variant in {"as configured": config, **variants}.items():
+        every = math.lcm(config.experiment.test_every, variant.experiment.test_every)  # of the pairs that the model is tested on
+        experiment = replace(variant.experiment, joint_alone=True, protocols=(ABLATED,), test_every=every)
+        variant = replace(variant, experiment=experiment, output=str(folder / file_name(name)))
+        folds = make_folds(ABLATED, pairs, tested, experiment.test_every)
+        claim(Path(variant.output), variant, pairs)
+        looked_at = json.dumps([variant.learning.seed, variant.learning.disturbance])
+
+        def study(jobs: int, variant: Config = variant, looked_at: str = looked_at) -> Study:
+            if looked_at not in studies:
+                studies[looked_at] = Study.of(pairs, variant, jobs)
+            return studies[looked_at]
+
+        log.info("%s", name)
+        run_folds(study, {ABLATED: folds}, variant, Path(variant.output) / "folds", jobs)
+        if rank_and_world()[0] == 0:
+            found = read_folds(Path(variant.output) / "folds" / ABLATED, pairs, folds)
+            scores[name], seconds[name] = score(found)[JOINT], found.seconds[JOINT]
+    if rank_and_world()[0] != 0:
+        return []
+    tables = [ablation_table(scores, seconds, lambda of: resample(of, config))]
+    write_tables(Path(config.output) / "tables", "ablations", tables)
+    return tables
+
+
+def load_pairs(config: Config) -> tuple[list[ScanPair], int]:
+    """The annotated pairs, those that are left out in turn first, and how many these are."""
+    experiment, data = config.experiment, config.data
+    patterns = (experiment.pairs,) if isinstance(experiment.pairs, str) else experiment.pairs
+    tested = list(PairFiles(*patterns)) if patterns else simulate(experiment.worlds, config, data.seed)
+    bare = [pair.name for pair in tested if pair.annotation is None]
+    if bare or not tested:
+        raise ValueError(f"experiment.pairs: expected annotated pairs, got {bare[:3] or 'none'}")
+    return [*tested, *simulate(experiment.also_train, config, data.seed + ALSO_TRAIN_SEED)], len(tested)
+
+
+def simulate(worlds: Sequence[str], config: Config, seed: int) -> list[ScanPair]:
+    """Pairs of every named world, their names told apart by its number."""
+    data = config.data
+    found = [simulate_pairs(WORLDS[world], data.pairs, data.sequences, seed + k) for k, world in enumerate(worlds)]
+    return [replace(pair, name=f"{seed + k}_{pair.name}") for k, of_world in enumerate(found) for pair in of_world]
+
+
+def claim(folder: Path, config: Config, pairs: Sequence[ScanPair]) -> None:
+    """Makes the folder this experiment's; refuses (ValueError) one whose folds were made with other settings or pairs."""
+    values = asdict(config)
+    for name in ("output", "overfit", "compare_chains"):
+        values.pop(name)
+    for name in ("figures", "resamples", "jobs", "leave_out", "protocols"):  # these may change from run to run
+        values["experiment"].pop(name)
+    ours = json.loads(json.dumps({**values, "tested": [pair.name for pair in pairs]}))
+    path = folder / SETTINGS
+    if path.is_file():
+        theirs = json.loads(path.read_text())
+        differ = sorted(differing(ours, theirs))
+        if differ:
+            names = ", ".join(differ[:5])
+            raise ValueError(f"--output {folder}: expected the folder of the same experiment, got one with another {names}")
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(path, json.dumps(ours, indent=1) + "\n")
+
+
+def differing(ours: Mapping[str, object], theirs: Mapping[str, object], prefix: str = "") -> list[str]:
+    """Dotted names of the settings in which two nested dictionaries differ."""
+    names = []
+    for key in {*ours, *theirs}:
+        one, other = ours.get(key), theirs.get(key)
+        if isinstance(one, Mapping) and isinstance(other, Mapping):
+            names += differing(one, other, f"{prefix}{key}.")
+        elif one != other:
+            names.append(f"{prefix}{key}")
+    return names
+
+
+def find_pairs(wanted: Sequence[str], pairs: Sequence[ScanPair]) -> list[ScanPair]:
+    """The pairs named SEQUENCE:NUMBER (ValueError where there is none such); without names the first of the first sequences."""
+    by_sequence: dict[str, list[ScanPair]] = {}
+    for pair in pairs:
+        by_sequence.setdefault(pair.sequence, []).append(pair)
+    if not wanted:
+        return [of_sequence[0] for of_sequence in by_sequence.values()][:DRAWN]
+    found = []
+    for name in wanted:
+        sequence, _, number = name.rpartition(":")
+        members = by_sequence.get(sequence, [])
+        if not (number.isdigit() and int(number) < len(members)):
+            known = ", ".join(f"{key}:0..{len(of) - 1}" for key, of in by_sequence.items())
+            raise ValueError(f"experiment.figures: expected SEQUENCE:NUMBER out of {known}, got {name}")
+        found.append(members[int(number)])
+    return found
+
+
+def score(results: Results) -> dict[str, list[PairScore]]:
+    """Every method's scores, in the order of the pairs."""
+    return {
+        method: [score_pair(pair, one) for pair, one in zip(results.pairs, predictions, strict=True)]
+        for method, predictions in results.predictions.items()
+    }
+
+
+def resample(scores: Sequence[PairScore], config: Config) -> Ints:
+    """(R, P) bootstrap weights: over sequences for simulated pairs, over blocks of neighbours in time for recorded ones."""
+    draw = by_blocks if config.experiment.pairs else by_sequence
+    return draw([one.sequence for one in scores], resamples=config.experiment.resamples)
+
+
+def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: str, config: Config, run: RunLog) -> list[Table]:
+    """Overview, Tables I to III, how sure and the differences of one protocol, logged as well."""
+    tables = report(scores, seconds=seconds, published=True)
+    weights = resample(scores[JOINT], config)
+    tables += [differences_table(name, scores, weights) for name in (JOINT, ENCODED, EXACT) if name in scores and len(scores) > 1]
+    tables = [replace(table, title=f"{table.title} ({protocol.replace('_', ' ')})") for table in tables]
+    for table in tables:
+        run.table(table)
+    for method, of_method in scores.items():
+        run.metrics(f"{protocol}/{method}", summarise(of_method))
+    return tables
+
+
+def draw(results: Results, scores: Scores, pairs: Sequence[ScanPair], folder: Path, run: RunLog) -> None:
+    """The paper's Figures 3 and 4 of the chosen pairs, and the pairs where the joint model loses most against its start."""
+    index = {pair.name: k for k, pair in enumerate(results.pairs)}
+
+    def answers(methods: Sequence[str], k: int) -> dict[str, PairPrediction]:
+        return {method: results.predictions[method][k] for method in methods if method in results.predictions}
+
+    for pair in pairs:
+        if pair.name in index:
+            k = index[pair.name]
+            figures = {
+                "associations": plot_associations(pair, answers(ASSOCIATION_FIGURE, k)),
+                "clusters": plot_clusters(pair, answers(CLUSTER_FIGURE, k)),
+            }
+            for kind, figure in figures.items():
+                save_figure(figure, folder / f"{kind}_{file_name(pair.name)}.png")
+                run.figure(f"{folder.name}/{kind}/{pair.name}", figure)
+    if RIVAL in results.predictions:
+        for k in worst_pairs(scores):
+            figure = plot_associations(results.pairs[k], answers((RIVAL, JOINT), k))
+            save_figure(figure, folder / f"loss_{file_name(results.pairs[k].name)}.png")
+
+
+def worst_pairs(scores: Scores) -> list[int]:
+    """The pairs where the joint model has most labels less right than its start has, both chains together."""
+    right = {name: np.array([one.association.right + one.cluster.right for one in scores[name]]) for name in (JOINT, RIVAL)}
+    loss = right[RIVAL] - right[JOINT]
+    return [int(k) for k in np.argsort(-loss, kind="stable")[:LOSSES] if loss[k] > 0]
+
+
+def write_tables(folder: Path, name: str, tables: Sequence[Table]) -> None:
+    """`NAME.md` with all tables, and a CSV file of each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / f"{name}.md", "\n\n".join(table.to_markdown() for table in tables) + "\n")
+    for table in tables:
+        write_whole(folder / f"{name}_{file_name(table.title.split(' (')[0].split(':')[0])}.csv".lower(), table.to_csv())
+
+
+def write_whole(path: Path, content: str) -> None:
+    """The file appears whole or not at all."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(content)
+    os.replace(temporary, path)

@@ -1,0 +1,48 @@
+"""."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torchcrf_scan.checks import choose
+from torchcrf_scan.data.worlds import WORLDS
+
+
+@dataclass(frozen=True)
+class ExperimentConfig:
+    """The paper's experiment, `torchcrf-scan experiment`: every pair is tested by models that have not seen it.
+
+    Attributes:
+        pairs: a file, folder or glob pattern of the annotated pairs, or a list of them; none: the simulated `worlds`.
+        worlds: names of simulated `WORLDS`, `data.pairs` pairs each, where no files are given.
+        also_train: names of simulated `WORLDS` that every fold trains on besides, `data.pairs` pairs each.
+        protocols: `leave_one_pair_out` (the paper's; consecutive pairs share a scan, so it leaks) and `leave_one_sequence_out`.
+        joint_alone: of all the methods, only the joint model (for ablations).
+        test_every: test every so many pairs only, for models that are slow to decode.
+        leave_out: features, named as in `FeatureConfig.left_out`: a variant without each of them (for ablations).
+        joint_variants: in leave_one_sequence_out, the joint model by exact likelihood and as a lattice too (half of a fold's time).
+        figures: pairs to draw, as SEQUENCE:NUMBER, the number counting from 0; none: one of each of the first three.
+        resamples: of the bootstrap.
+        jobs: processes; 0: one a core.
+    """
+
+    pairs: tuple[str, ...] | str = ()
+    worlds: tuple[str, ...] = ("street",)
+    also_train: tuple[str, ...] = ()
+    protocols: tuple[str, ...] = ("leave_one_pair_out", "leave_one_sequence_out")
+    joint_alone: bool = False
+    test_every: int = 1
+    leave_out: tuple[str, ...] = ()
+    joint_variants: bool = True
+    figures: tuple[str, ...] = ()
+    resamples: int = 2000
+    jobs: int = 0
+
+    def __post_init__(self) -> None:
+        for world in (*self.worlds, *self.also_train):
+            choose("worlds", world, tuple(WORLDS))
+        for protocol in self.protocols:
+            choose("protocols", protocol, ("leave_one_pair_out", "leave_one_sequence_out"))
+        for name, least in (("test_every", 1), ("resamples", 1), ("jobs", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected {least} or more, got {getattr(self, name)}")

@@ -1,0 +1,58 @@
+"""Which engine runs the rounds: the loops (`torchcrf_scan.fast`), or the same in tensors (`torchcrf_scan.inference`)."""
+
+from __future__ import annotations
+
+import torch
+
+from torchcrf_scan.config import ModelConfig
+
+KNOWN_SETTINGS = {  # of `InferenceConfig` and `ModelConfig`: what the loops know
+    "candidate_search": ("motion",),
+    "schedule": ("sweep",),
+    "temperature": (0.0,),
+    "motion_weights": ("hard",),
+    "chains": ("joint",),
+    "coupling": ("motions",),
+}
+
+
+def can_run(backend: str, device: torch.device) -> bool:
+    """Whether loops may take the place of tensors that have no gradient, on a device.
+
+    Raises:
+        ValueError: `backend` is `compiled`, and they cannot.
+    """
+    return _decide(backend, _why_not_here(device))
+
+
+def can_decode(model: ModelConfig, device: torch.device, *, needs_gradient: bool = False, has_embeddings: bool = False) -> bool:
+    """Whether loops run the rounds of a model; errors as in `can_run`.
+
+    has_embeddings: some were given, or the model's encoder makes them.
+    """
+    inference = model.inference
+    chosen = {name: getattr(inference if hasattr(inference, name) else model, name) for name in KNOWN_SETTINGS}
+    unknown = [f"{name}: {chosen[name]}" for name, known in KNOWN_SETTINGS.items() if chosen[name] not in known]
+    reason = _why_not_here(device)
+    if model.features.smooth > 0:
+        unknown.append(f"smooth: {model.features.smooth}")
+    if unknown:
+        reason = f"settings that it knows, got {', '.join(unknown)}"
+    elif has_embeddings:
+        reason = "no embeddings, got some (backend eager or auto takes them)"
+    elif needs_gradient:
+        reason = "no gradient to be asked for (torch.no_grad)"
+    return _decide(inference.backend, reason)
+
+
+def _why_not_here(device: torch.device) -> str | None:
+    """What the loops would need, where they cannot run."""
+    if torch.compiler.is_compiling():
+        return "an ordinary call, not a compiled or exported one"
+    return f"scans on the CPU, got {device}" if device.type != "cpu" else None
+
+
+def _decide(backend: str, reason: str | None) -> bool:
+    if backend == "compiled" and reason is not None:
+        raise ValueError(f"backend: expected for compiled {reason}")
+    return backend != "eager" and reason is None

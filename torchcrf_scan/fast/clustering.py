@@ -1,0 +1,320 @@
+"""The clustering chain of one pair: potentials without feature tensors, and an exact pass.
+
+`features.clustering`, `features.extension` and `features.potentials` in loops: the weights are applied on the fly, and only
+clusters that exist cost anything.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from torchcrf_scan.fast.free_space import Sweep, look
+from torchcrf_scan.features.scales import CLUSTERING_WEIGHTS, GATE_WIDTH, KAPPA
+from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.messages import max_marginals
+from torchcrf_scan.loops.nearest import Boxes, nearest
+from torchcrf_scan.loops.rigid import inverse
+
+if TYPE_CHECKING:
+    from torchcrf_scan.inference.state import Parameters
+
+
+class ClusteringWeights(NamedTuple):
+    """The chain's weights by their names in `CLUSTERING_WEIGHTS`."""
+
+    cluster_distance: float
+    outlier: float
+    cluster_inlier_in: float
+    cluster_inlier_out: float
+    gate: float
+    outlier_bias: float
+    seen_through: float
+    seen_through_back: float
+    hidden: float
+    hidden_back: float
+    outlier_seen_through: float
+    outlier_hidden: float
+    sequence: float
+    neighbour_weight_same: float
+    neighbour_weight_different: float
+    neighbour_stiffness_same: float
+    neighbour_stiffness_different: float
+    neighbour_distance_same: float
+    neighbour_distance_different: float
+    pairwise_outlier: float
+
+
+class ClusteringModel(NamedTuple):
+    """What was learned of the clustering chain; the scales are those of `features.scales.Scales`."""
+
+    weights: ClusteringWeights
+    cluster_distance: float
+    outlier_threshold: float
+    gate: float
+    neighbour_weight: float
+    neighbour_distance: float
+
+
+def clustering_model(parameters: Parameters) -> ClusteringModel:
+    """The learned numbers out of their tensors."""
+    weights = dict(zip(CLUSTERING_WEIGHTS, parameters.clustering.detach().double().tolist(), strict=True))
+    scales = parameters.scales
+    return ClusteringModel(
+        ClusteringWeights(**weights),
+        float(scales.cluster_distance),
+        float(scales.outlier_threshold),
+        float(scales.gate),
+        float(scales.neighbour_weight),
+        float(scales.neighbour_distance),
+    )
+
+
+class Tables(NamedTuple):
+    """Everything of the chain's potentials at some motions and associations; any of the clusters may still be left out.
+
+    Attributes:
+        moved: (C, N, 2) source points under every motion.
+        residual: (C, N) distance to the associated target point, or to the nearest for an outlier; inf of a cluster that is not.
+        log_inlier: (C, N) node potentials of the clusters, -inf where impossible.
+        log_outlier: (N,) those of the outlier, but for the weight on no cluster coming near.
+        length: (N-1,) of the edges. same, different: (N-1,) edge potentials of one cluster and of two, but for their parting.
+    """
+
+    moved: Array
+    residual: Array
+    log_inlier: Array
+    log_outlier: Array
+    length: Array
+    same: Array
+    different: Array
+
+
+@kernel
+def capped_square(error: float, scale: float) -> float:
+    """`features.scales.robust_square`."""
+    return -min((error / scale) ** 2, KAPPA)
+
+
+@kernel
+def distance(dx: float, dy: float) -> float:
+    """Length of a vector; `hypot` guards against overflow, which takes several times as long."""
+    return math.sqrt(dx * dx + dy * dy)
+
+
+@kernel
+def nearest_to_outliers(boxes: Boxes, source: Array, motions: Array, active: Booleans, association: Integers) -> Integers:
+    """(N, C) nearest target point under every active motion, for points without a partner; 0 elsewhere.
+
+    Args:
+        boxes: of the target's M >= 1 points. source: (N, 2). motions: (C, 3). active: (C,). association: (N,), -1 outlier.
+    """
+    index = np.zeros((len(source), len(motions)), np.int64)
+    for c in range(len(motions)):
+        if not active[c]:
+            continue
+        cos, sin = math.cos(motions[c, 0]), math.sin(motions[c, 0])
+        guess = 0
+        for i in range(len(source)):
+            if association[i] < 0:
+                x = cos * source[i, 0] - sin * source[i, 1] + motions[c, 1]
+                y = sin * source[i, 0] + cos * source[i, 1] + motions[c, 2]
+                guess = nearest(boxes, x, y, guess)[1]
+                index[i, c] = guess
+    return index
+
+
+@kernel
+def edge_potentials(source: Array, target: Array, association: Integers, model: ClusteringModel) -> tuple[Array, Array, Array]:
+    """`length`, `same` and `different` of `Tables`. source: (N, 2); target: (M, 2); association: (N,)."""
+    E = max(len(source) - 1, 0)
+    w = model.weights
+    length, same, different = np.empty(E), np.empty(E), np.empty(E)
+    for i in range(E):
+        length[i] = distance(source[i + 1, 0] - source[i, 0], source[i + 1, 1] - source[i, 1])
+        near = math.exp(-((length[i] / model.neighbour_weight) ** 2))
+        same[i] = w.sequence + w.neighbour_weight_same * near
+        different[i] = w.neighbour_weight_different * (1 - near)
+        a, b = association[i], association[i + 1]
+        if a >= 0 and b >= 0:
+            stretch = distance(target[b, 0] - target[a, 0], target[b, 1] - target[a, 1]) - length[i]
+            stiff = math.exp(-((stretch / model.neighbour_distance) ** 2))
+            same[i] += w.neighbour_stiffness_same * stiff
+            same[i] += w.neighbour_distance_same * capped_square(stretch, model.neighbour_distance)
+            different[i] += w.neighbour_stiffness_different * (1 - stiff)
+    return length, same, different
+
+
+@kernel
+def fill_residual(
+    source: Array,
+    target: Array,
+    motion: Array,
+    association: Integers,
+    nearest_target: Integers,
+    c: int,
+    moved: Array,
+    residual: Array,
+) -> None:
+    """`moved` (N, 2) and `residual` (N,) of cluster c at its motion (3,). Other arguments as in `tabulate`."""
+    cos, sin = math.cos(motion[0]), math.sin(motion[0])
+    for i in range(len(source)):
+        x = cos * source[i, 0] - sin * source[i, 1] + motion[1]
+        y = sin * source[i, 0] + cos * source[i, 1] + motion[2]
+        j = association[i] if association[i] >= 0 else nearest_target[i, c]
+        moved[i, 0], moved[i, 1], residual[i] = x, y, distance(x - target[j, 0], y - target[j, 1])
+
+
+@kernel
+def fill_agreement(
+    moved: Array, residual: Array, association: Integers, reach: Booleans, c: int, model: ClusteringModel, log_inlier: Array
+) -> None:
+    """Potentials (N,) of cluster c but for what beams say, -inf beyond its reach. Other arguments as in `tabulate`."""
+    w = model.weights
+    for i in range(len(moved)):
+        if not reach[i, c]:
+            log_inlier[i] = -np.inf
+            continue
+        total = w.cluster_distance * capped_square(residual[i], model.cluster_distance)
+        if w.gate != 0:
+            total -= w.gate / (1 + math.exp(-(residual[i] / model.gate - 1) / GATE_WIDTH))
+        log_inlier[i] = total + (w.cluster_inlier_in if association[i] >= 0 else 0.0)
+
+
+@kernel
+def subtract_ahead(sweep: Sweep, moved: Array, model: ClusteringModel, log_inlier: Array, log_outlier: Array) -> None:
+    """Takes off what the target's beams say against (N, 2) moved points, where they may be in the cluster.
+
+    log_inlier: (N,). log_outlier: (N,), the outliers', which gain by what is said against the background; of movers (0,).
+    """
+    w = model.weights
+    is_background = len(log_outlier) > 0
+    if w.seen_through == 0 and w.hidden == 0 and not (is_background and (w.outlier_seen_through != 0 or w.outlier_hidden != 0)):
+        return
+    for i in range(len(moved)):
+        if is_background or log_inlier[i] > -np.inf:
+            seen_through, hidden = look(sweep, moved[i, 0], moved[i, 1])
+            log_inlier[i] -= w.seen_through * seen_through + w.hidden * hidden
+            if is_background:
+                log_outlier[i] += w.outlier_seen_through * seen_through + w.outlier_hidden * hidden
+
+
+@kernel
+def subtract_back(
+    sweep: Sweep, target: Array, motion: Array, association: Integers, model: ClusteringModel, log_inlier: Array
+) -> None:
+    """Takes off what the source's beams say against the points' partners. motion: (3,) of the cluster; log_inlier: (N,)."""
+    w = model.weights
+    if w.seen_through_back == 0 and w.hidden_back == 0:
+        return
+    back = inverse(motion)
+    cos, sin = math.cos(back[0]), math.sin(back[0])
+    for i in range(len(association)):
+        j = association[i]
+        if j >= 0 and log_inlier[i] > -np.inf:
+            x = cos * target[j, 0] - sin * target[j, 1] + back[1]
+            y = sin * target[j, 0] + cos * target[j, 1] + back[2]
+            seen_through, hidden = look(sweep, x, y)
+            log_inlier[i] -= w.seen_through_back * seen_through + w.hidden_back * hidden
+
+
+@kernel
+def tabulate(
+    source: Array,
+    target: Array,
+    source_sweep: Sweep,
+    target_sweep: Sweep,
+    motions: Array,
+    active: Booleans,
+    reach: Booleans,
+    association: Integers,
+    nearest_target: Integers,
+    model: ClusteringModel,
+) -> Tables:
+    """Motions and associations plugged in.
+
+    Args:
+        source: (N, 2); target: (M, 2), and their sweeps.
+        motions: (C, 3). active: (C,) clusters that exist, the background among them.
+        reach: (N, C) clusters that a point is near enough to.
+        association: (N,), -1 outlier. nearest_target: (N, C) nearest target point, of outliers at least.
+    """
+    N, C = len(source), len(motions)
+    moved, residual, log_inlier, log_outlier = np.zeros((C, N, 2)), np.empty((C, N)), np.empty((C, N)), np.empty(N)
+    for i in range(N):
+        log_outlier[i] = model.weights.outlier_bias + (model.weights.cluster_inlier_out if association[i] < 0 else 0.0)
+    for c in range(C):
+        if active[c]:
+            fill_residual(source, target, motions[c], association, nearest_target, c, moved[c], residual[c])
+            fill_agreement(moved[c], residual[c], association, reach, c, model, log_inlier[c])
+            subtract_ahead(target_sweep, moved[c], model, log_inlier[c], log_outlier if c == 0 else log_outlier[:0])
+            subtract_back(source_sweep, target, motions[c], association, model, log_inlier[c])
+        else:
+            for i in range(N):
+                residual[c, i], log_inlier[c, i] = np.inf, -np.inf
+    length, same, different = edge_potentials(source, target, association, model)
+    return Tables(moved, residual, log_inlier, log_outlier, length, same, different)
+
+
+@kernel
+def node_potentials(tables: Tables, states: Integers, model: ClusteringModel) -> Array:
+    """(N, P + 1) of P clusters, and last of the outlier. states: (P,) clusters that exist."""
+    N, P = len(tables.log_outlier), len(states)
+    log_unary = np.empty((N, P + 1))
+    for i in range(N):
+        least = np.inf
+        for s in range(P):
+            log_unary[i, s] = tables.log_inlier[states[s], i]
+            least = min(least, tables.residual[states[s], i])
+        log_unary[i, P] = tables.log_outlier[i] + (model.weights.outlier if least > model.outlier_threshold else 0.0)
+    return log_unary
+
+
+@kernel
+def transition_potentials(tables: Tables, states: Integers, log_unary: Array, model: ClusteringModel) -> Array:
+    """(N-1, P + 1, P + 1) from every state to every state of the next point; finite. log_unary: as `node_potentials` gives it."""
+    P, w = len(states), model.weights
+    log_pairwise = np.empty((len(tables.length), P + 1, P + 1))
+    for i in range(len(tables.length)):
+        edge = log_pairwise[i]
+        for s in range(P):
+            is_possible = log_unary[i, s] > -np.inf
+            x, y = tables.moved[states[s], i, 0], tables.moved[states[s], i, 1]
+            for t in range(P):
+                edge[s, t] = tables.same[i] if s == t else tables.different[i]
+                if s != t and is_possible and log_unary[i + 1, t] > -np.inf:
+                    k = states[t]
+                    across = distance(tables.moved[k, i + 1, 0] - x, tables.moved[k, i + 1, 1] - y)
+                    parting = capped_square(across - tables.length[i], model.neighbour_distance)
+                    edge[s, t] += w.neighbour_distance_different * parting
+            edge[s, P] = edge[P, s] = w.pairwise_outlier
+        edge[P, P] = w.sequence
+    return log_pairwise
+
+
+@kernel
+def cluster(tables: Tables, active: Booleans, model: ClusteringModel) -> tuple[Array, Integers]:
+    """An exact pass over the chain: normalised log-beliefs (N, D), last of the outlier, and (N,) labels, -1 outlier.
+
+    active: (C,) clusters that exist, no more than those of the tables.
+    """
+    N, C = len(tables.log_outlier), len(active)
+    states = np.flatnonzero(active)
+    P = len(states)
+    log_unary = node_potentials(tables, states, model)
+    some = max_marginals(log_unary, transition_potentials(tables, states, log_unary, model))
+    log_beliefs, labels = np.empty((N, C + 1)), np.empty(N, np.int64)
+    for i in range(N):
+        best, labels[i] = -np.inf, -1
+        for c in range(C):
+            log_beliefs[i, c] = -np.inf
+        for s in range(P):
+            log_beliefs[i, states[s]] = some[i, s]
+            if some[i, s] > best:
+                best, labels[i] = some[i, s], states[s]
+        log_beliefs[i, C] = some[i, P]
+        if some[i, P] > best:
+            labels[i] = -1
+    return log_beliefs, labels

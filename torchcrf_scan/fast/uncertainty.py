@@ -1,0 +1,374 @@
+"""How sure the answer for one pair is; `inference.uncertainty` in loops."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from torchcrf_scan.fast.motion import POINT, Members, members_of, places_of
+from torchcrf_scan.inference.uncertainty import MOST_CERTAIN, NEIGHBOURS, NOTHING, RUN, STEPS, STRETCH, TINY, WITHIN
+from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.prediction import LEAST_SHARE
+
+SWEEPS = 30  # of Jacobi's method, more than it ever takes
+EXCLUDED = math.exp(2 * MOST_CERTAIN)  # what a state counts in the sum that it is left out of
+
+
+class Fit(NamedTuple):
+    """A cluster's residuals near its motion, as functions of (theta L, x, y); `inference.uncertainty.Linearisation`.
+
+    Attributes:
+        weights: (P,). residual: (P, 2). jacobian: (P, 2, 3). freedom: (P,). centre: (2,). length: L.
+    """
+
+    weights: Array
+    residual: Array
+    jacobian: Array
+    freedom: Array
+    centre: Array
+    length: float
+
+
+@kernel
+def inverse_of(matrix: Array) -> Array:
+    """(3, 3) inverse by elimination with pivots."""
+    left, right = matrix.copy(), np.eye(3)
+    for k in range(3):
+        pivot = k
+        for r in range(k + 1, 3):
+            if abs(left[r, k]) > abs(left[pivot, k]):
+                pivot = r
+        for d in range(3):
+            left[k, d], left[pivot, d] = left[pivot, d], left[k, d]
+            right[k, d], right[pivot, d] = right[pivot, d], right[k, d]
+        share = 1 / left[k, k]
+        for d in range(3):
+            left[k, d], right[k, d] = left[k, d] * share, right[k, d] * share
+        for r in range(3):
+            factor = left[r, k]
+            if r != k and factor != 0:
+                for d in range(3):
+                    left[r, d] -= factor * left[k, d]
+                    right[r, d] -= factor * right[k, d]
+    return right
+
+
+@kernel
+def product(a: Array, b: Array) -> Array:
+    """(3, 3) of two such."""
+    found = np.zeros((3, 3))
+    for r in range(3):
+        for d in range(3):
+            found[r, d] = a[r, 0] * b[0, d] + a[r, 1] * b[1, d] + a[r, 2] * b[2, d]
+    return found
+
+
+@kernel
+def turn_away(matrix: Array, vectors: Array, p: int, q: int) -> None:
+    """One of Jacobi's rotations, in place, after which matrix[p, q] is 0. matrix: (3, 3) symmetric; vectors: (3, 3), rows."""
+    if matrix[p, q] == 0:
+        return
+    tilt = (matrix[q, q] - matrix[p, p]) / (2 * matrix[p, q])
+    t = (1.0 if tilt >= 0 else -1.0) / (abs(tilt) + math.sqrt(tilt * tilt + 1))
+    c = 1 / math.sqrt(t * t + 1)
+    s = t * c
+    r = 3 - p - q
+    matrix[p, p] -= t * matrix[p, q]
+    matrix[q, q] += t * matrix[p, q]
+    a, b = matrix[r, p], matrix[r, q]
+    matrix[r, p] = matrix[p, r] = c * a - s * b
+    matrix[r, q] = matrix[q, r] = s * a + c * b
+    matrix[p, q] = matrix[q, p] = 0.0
+    for d in range(3):
+        a, b = vectors[p, d], vectors[q, d]
+        vectors[p, d], vectors[q, d] = c * a - s * b, s * a + c * b
+
+
+@kernel
+def axes_of(symmetric: Array) -> tuple[Array, Array]:
+    """(3,) eigenvalues, ascending, and (3, 3) unit eigenvectors, a row each. symmetric: (3, 3)."""
+    matrix, vectors = symmetric.copy(), np.eye(3)
+    for _ in range(SWEEPS):
+        aside = abs(matrix[0, 1]) + abs(matrix[0, 2]) + abs(matrix[1, 2])
+        if aside <= 1e-18 * (abs(matrix[0, 0]) + abs(matrix[1, 1]) + abs(matrix[2, 2])):
+            break
+        for r in range(3):
+            turn_away(matrix, vectors, r, (r + 1) % 3)
+    values = np.empty(3)
+    for k in range(3):
+        values[k] = matrix[k, k]
+    for k in (0, 1, 0):  # sorts three
+        if values[k] > values[k + 1]:
+            values[k], values[k + 1] = values[k + 1], values[k]
+            for d in range(3):
+                vectors[k, d], vectors[k + 1, d] = vectors[k + 1, d], vectors[k, d]
+    return values, vectors
+
+
+@kernel
+def surface_tangents(points: Array, mask: Booleans, noise: float) -> tuple[Array, Booleans]:
+    """(N, 2) direction of the surface at every point, from a stretch long beside the noise, and (N,) where there is one.
+
+    points: (N, 2) in beam order. mask: (N,) points that count.
+    """
+    N = len(points)
+    tangent, is_found = np.zeros((N, 2)), np.zeros(N, np.bool_)
+    for i in range(N):
+        if not mask[i]:
+            continue
+        low, high = max(i - NEIGHBOURS, 0), min(i + NEIGHBOURS + 1, N)
+        nearest = np.inf
+        for j in range(low, high):
+            if mask[j] and j != i:
+                nearest = min(nearest, (points[j, 0] - points[i, 0]) ** 2 + (points[j, 1] - points[i, 1]) ** 2)
+        if nearest == np.inf:
+            continue
+        stretch = (STRETCH * noise) ** 2 + STEPS**2 * nearest
+        total = mx = my = 0.0
+        for j in range(low, high):
+            if mask[j]:
+                x, y = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+                w = max(1 - (x * x + y * y) / stretch, 0.0)
+                total, mx, my = total + w, mx + w * x, my + w * y
+        total = max(total, 1e-9)
+        mx, my = mx / total, my / total
+        xx = yy = xy = 0.0
+        for j in range(low, high):
+            if mask[j]:
+                x, y = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+                w = max(1 - (x * x + y * y) / stretch, 0.0) / total
+                xx, yy, xy = xx + w * (x - mx) ** 2, yy + w * (y - my) ** 2, xy + w * (x - mx) * (y - my)
+        angle = math.atan2(2 * xy, xx - yy) / 2 if xy != 0 or xx != yy else 0.0
+        tangent[i, 0], tangent[i, 1] = math.cos(angle), math.sin(angle)
+        is_found[i] = xx + yy > 0
+    return tangent, is_found
+
+
+@kernel
+def linearise(
+    members: Members, places: Integers, motion: Array, metric: int, scale: float, noise: float, tangent: Array, is_found: Booleans
+) -> Fit:
+    """A cluster's fit at its motion. tangent, is_found: of all source points, as `surface_tangents` gives them."""
+    P = len(places)
+    cos, sin = math.cos(motion[0]), math.sin(motion[0])
+    weights, residual, arm, centre = np.ones(P), np.empty((P, 2)), np.empty((P, 2)), np.zeros(2)
+    total = 0.0
+    for p in range(P):
+        x, y = members.points[p, 0], members.points[p, 1]
+        arm[p, 0], arm[p, 1] = cos * x - sin * y + motion[1], sin * x + cos * y + motion[2]
+        residual[p, 0], residual[p, 1] = arm[p, 0] - members.partner[p, 0], arm[p, 1] - members.partner[p, 1]
+        if metric != POINT:
+            weights[p] = 1 / (1 + (residual[p, 0] ** 2 + residual[p, 1] ** 2) / scale**2)
+        total += weights[p]
+        centre[0] += weights[p] * arm[p, 0]
+        centre[1] += weights[p] * arm[p, 1]
+    total = max(total, 1e-9)
+    centre[0], centre[1] = centre[0] / total, centre[1] / total
+    second = 0.0
+    for p in range(P):
+        arm[p, 0], arm[p, 1] = arm[p, 0] - centre[0], arm[p, 1] - centre[1]
+        second += weights[p] * (arm[p, 0] ** 2 + arm[p, 1] ** 2)
+    length = math.sqrt(second / total + noise**2)
+    jacobian, freedom = np.empty((P, 2, 3)), np.full(P, 2.0)
+    for p in range(P):
+        ux = uy = 0.0
+        if metric != POINT:
+            ux, uy = members.tangent[p, 0], members.tangent[p, 1]
+            if is_found[places[p]] and (ux != 0 or uy != 0):
+                tx, ty = tangent[places[p], 0], tangent[places[p], 1]
+                ux, uy = cos * tx - sin * ty, sin * tx + cos * ty
+        lx, ly = -arm[p, 1] / length, arm[p, 0] / length
+        along = ux * lx + uy * ly
+        jacobian[p, 0, 0], jacobian[p, 1, 0] = lx - ux * along, ly - uy * along
+        jacobian[p, 0, 1], jacobian[p, 1, 1] = 1 - ux * ux, -uy * ux
+        jacobian[p, 0, 2], jacobian[p, 1, 2] = -ux * uy, 1 - uy * uy
+        along = ux * residual[p, 0] + uy * residual[p, 1]
+        residual[p, 0], residual[p, 1] = residual[p, 0] - ux * along, residual[p, 1] - uy * along
+        freedom[p] -= ux * ux + uy * uy
+    return Fit(weights, residual, jacobian, freedom, centre, length)
+
+
+@kernel
+def shared_scores(score: Array, places: Integers) -> Array:
+    """(3, 3) mean over all ways to cut the scan into runs of `RUN` of the sum of the runs' squared scores.
+
+    score: (P, 3) of the points at places (P,), ascending.
+    """
+    P = len(places)
+    together = np.zeros((3, 3))
+    a = b = c = 0.0
+    enters = leaves = 0
+    for last in range(places[0] if P > 0 else 0, (places[P - 1] + RUN) if P > 0 else 0):
+        if enters < P and places[enters] == last:
+            a, b, c = a + score[enters, 0], b + score[enters, 1], c + score[enters, 2]
+            enters += 1
+        if leaves < P and places[leaves] == last - RUN:
+            a, b, c = a - score[leaves, 0], b - score[leaves, 1], c - score[leaves, 2]
+            leaves += 1
+        if enters == leaves:
+            a = b = c = 0.0
+        together[0, 0] += a * a
+        together[0, 1] += a * b
+        together[0, 2] += a * c
+        together[1, 1] += b * b
+        together[1, 2] += b * c
+        together[2, 2] += c * c
+    for r in range(3):
+        for d in range(r, 3):
+            together[r, d] /= RUN
+            together[d, r] = together[r, d]
+    return together
+
+
+@kernel
+def cluster_covariance(
+    fit: Fit, places: Integers, motion: Array, metric: int, noise: float, reach: float
+) -> tuple[Array, Array, Array]:
+    """(3, 3) covariance, (3,) information and (3, 3) directions of one motion; what they are says `inference.uncertainty`."""
+    P = len(places)
+    score, step = np.empty((P, 3)), np.zeros(3)
+    apart, normal = np.zeros((3, 3)), np.zeros((3, 3))
+    total = squares = free = 0.0
+    for p in range(P):
+        w, j = fit.weights[p], fit.jacobian[p]
+        rx, ry = fit.residual[p, 0], fit.residual[p, 1]
+        total += w
+        squares += w * (rx * rx + ry * ry)
+        free += w * fit.freedom[p]
+        for r in range(3):
+            score[p, r] = w * (j[0, r] * rx + j[1, r] * ry)
+            step[r] += score[p, r]
+            for d in range(r, 3):
+                both = w * (j[0, r] * j[0, d] + j[1, r] * j[1, d])
+                normal[r, d] += both
+                apart[r, d] += w * both
+    total = max(total, 1e-9)
+    variance = max(2 * noise**2, squares / max(free, 1e-9))
+    meat = shared_scores(score, places)
+    for r in range(3):
+        for d in range(3):
+            low, high = min(r, d), max(r, d)
+            meat[r, d] += variance * (apart[low, high] + (NOTHING if r == d else 0.0)) + step[r] * step[d]
+    for r in range(3):
+        for d in range(r, 3):
+            normal[r, d] /= total
+            normal[d, r] = normal[r, d]
+    information, directions = axes_of(normal)
+    keep = np.zeros((3, 3))
+    for k in range(3):
+        if information[k] >= LEAST_SHARE:
+            for r in range(3):
+                for d in range(3):
+                    keep[r, d] += directions[k, r] * directions[k, d]
+    if metric != POINT:  # by what is left of the tangents' noise, and by steps along the surface
+        for r in range(3):
+            normal[r, r] -= LEAST_SHARE
+    bread = product(product(keep, normal), keep)
+    known = product(product(bread, inverse_of(meat)), bread)
+    for r in range(3):
+        for d in range(3):
+            known[r, d] *= total * total
+    known[0, 0] += 3 / (math.pi * fit.length) ** 2
+    known[1, 1] += 1 / reach**2
+    known[2, 2] += 1 / reach**2
+    return (
+        about_origin(inverse_of(known), fit.length, motion[1] - fit.centre[0], motion[2] - fit.centre[1]),
+        information,
+        directions,
+    )
+
+
+@kernel
+def about_origin(local: Array, length: float, x: float, y: float) -> Array:
+    """(3, 3) covariance of (theta, tx, ty) from that of (theta L, x, y) about a centroid that (x, y) leads to t from."""
+    change = np.zeros((3, 3))
+    change[0, 0], change[1, 0], change[2, 0] = 1 / length, -y / length, x / length
+    change[1, 1] = change[2, 2] = 1.0
+    covariance = product(product(change, local), change.T.copy())
+    for r in range(3):
+        for d in range(r):
+            covariance[r, d] = covariance[d, r] = (covariance[r, d] + covariance[d, r]) / 2
+    return covariance
+
+
+@kernel
+def motion_covariance(
+    source: Array,
+    target: Array,
+    tangents: Array,
+    association: Integers,
+    cluster: Integers,
+    motions: Array,
+    metric: int,
+    scale: float,
+    noise: float,
+) -> tuple[Array, Array, Array]:
+    """Covariances (C, 3, 3), information (C, 3) and directions (C, 3, 3) of the motions (C, 3); see `inference.uncertainty`.
+
+    Args:
+        source: (N, 2) in beam order; target, tangents: (M, 2); association, cluster: (N,), -1 outlier, of the last fit.
+        metric: POINT, else point-to-line. scale: residual at which a robust weight has fallen to a half.
+        noise: standard deviation of a return. Both in the unit of the points.
+    """
+    N, C = len(source), len(motions)
+    reach = 0.0
+    mask = np.empty(N, np.bool_)
+    for i in range(N):
+        reach = max(reach, source[i, 0] ** 2 + source[i, 1] ** 2)
+        mask[i] = cluster[i] >= 0 and association[i] >= 0
+    reach = max(math.sqrt(reach), 1e-3)
+    noise = max(noise, TINY * reach)
+    if metric == POINT:
+        mask[:] = False
+    tangent, is_found = surface_tangents(source, mask, noise)
+    covariance, information, directions = np.empty((C, 3, 3)), np.empty((C, 3)), np.empty((C, 3, 3))
+    for c in range(C):
+        places = places_of(association, cluster, c)
+        members = members_of(source, target, tangents, association, places)
+        fit = linearise(members, places, motions[c], metric, scale, noise, tangent, is_found)
+        covariance[c], information[c], directions[c] = cluster_covariance(fit, places, motions[c], metric, noise, reach)
+    return covariance, information, directions
+
+
+@kernel
+def confidence(yes: float, no: float, calibration: Array) -> float:
+    """Calibrated probability of what has belief `yes` against `no`. calibration: (2,) slope and offset."""
+    return 1 / (1 + math.exp(-(calibration[0] * (math.log(yes) - math.log(no)) + calibration[1])))
+
+
+@kernel
+def association_confidence(log_association: Array, candidates: Integers, association: Integers, calibration: Array) -> Array:
+    """(N,) calibrated probability that an association is right within `WITHIN` target points.
+
+    log_association: (N, K+1). candidates: (N, K). association: (N,), -1 outlier. calibration: (2,) slope and offset.
+    """
+    N, K = candidates.shape
+    sure = np.empty(N)
+    for i in range(N):
+        yes = no = 0.0
+        for k in range(K + 1):
+            belief = math.exp(max(log_association[i, k], MOST_CERTAIN))
+            is_near = k < K and association[i] >= 0 and abs(candidates[i, k] - association[i]) <= WITHIN
+            is_chosen = is_near or (k == K and association[i] < 0)
+            yes += belief if is_chosen else EXCLUDED
+            no += EXCLUDED if is_chosen else belief
+        sure[i] = confidence(yes, no, calibration)
+    return sure
+
+
+@kernel
+def cluster_confidence(log_cluster: Array, cluster: Integers, calibration: Array) -> Array:
+    """(N,) calibrated probability of the chosen cluster. log_cluster: (N, D). cluster: (N,), -1 outlier. calibration: (2,)."""
+    N, D = log_cluster.shape
+    sure = np.empty(N)
+    for i in range(N):
+        chosen = cluster[i] if cluster[i] >= 0 else D - 1
+        yes = no = 0.0
+        for k in range(D):
+            belief = math.exp(max(log_cluster[i, k], MOST_CERTAIN))
+            yes += belief if k == chosen else EXCLUDED
+            no += EXCLUDED if k == chosen else belief
+        sure[i] = confidence(yes, no, calibration)
+    return sure

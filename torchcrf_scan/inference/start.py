@@ -1,0 +1,105 @@
+"""."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchcrf_scan.batch import ScanPairBatch, scale_motions
+from torchcrf_scan.features.candidates import squared_distances
+from torchcrf_scan.features.potentials import possible_clusters
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference.uncertainty import surface_tangents
+from torchcrf_scan.tree import tensor_tree
+
+ASSOCIATION_GATE = 3.0  # units of footprint and noise beyond which a point has no associate
+
+REACH_EXTENT = 0.5  # of an object's seen extent, and
+
+REACH_UNITS = 4.0  # units of resolution beyond it may still be the object
+
+FOOTPRINT = 0.0175  # radians; spacing of a one-degree scanner on a surface that faces it
+
+
+@tensor_tree
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Motions to begin with.
+
+    Attributes:
+        motions: (B, C, 3), active: (B, C).
+        association: (B, N) nearest target point under the best motion, -1 where none comes near.
+        target_tangents: (B, M, 2) direction of the target's surface at every point, 0 where it has none.
+        reach: (B, N, C) bool, points near enough to the segment that a mover was found by: an object is in one place. None: any.
+        log_odds: (B, C) what the score says of every mover, those that it alone would not accept (and that are not `active`)
+            included; -inf where there is none, inf for the background. None: `active` has been decided.
+    """
+
+    motions: Tensor
+    active: Tensor
+    association: Tensor
+    target_tangents: Tensor
+    reach: Tensor | None = None
+    log_odds: Tensor | None = None
+
+    @classmethod
+    def at(cls, batch: ScanPairBatch, motions: Tensor, active: Tensor) -> Start:
+        """The start where somebody else knows the motions; associations and the surfaces' directions follow from them.
+
+        motions: (B, C, 3), active: (B, C). No step depends on a tensor's value.
+        """
+        tangents, is_found = surface_tangents(batch.target, batch.target_mask, batch.range_noise)
+        association = nearest_association(batch, motions, active)
+        return cls(motions, active, association, torch.where(is_found[..., None], tangents, torch.zeros_like(tangents)))
+
+    def considered(self) -> Start:
+        """The same with all movers that the score does not rule out, for the model to decide about."""
+        return self if self.log_odds is None else replace(self, active=self.log_odds > -torch.inf)
+
+    def background_alone(self) -> Start:
+        """The start of CRF-Matching, which has one motion."""
+        return replace(self, motions=self.motions[:, :1], active=self.active[:, :1], reach=None, log_odds=None)
+
+    def scaled(self, factor: Tensor) -> Start:
+        """The same start in another unit of length, a factor (B,) a pair."""
+        return replace(self, motions=scale_motions(self.motions, factor))
+
+
+def within_reach(points: Tensor, members: Tensor, unit: Tensor) -> Tensor:
+    """Points that may belong to the object some of whose points are known: within half its extent and a few units of them.
+
+    Args:
+        points: (B, N, 2). members: (B, C, N) known points of every cluster. unit: (B,) metres.
+
+    Returns:
+        (B, N, C); everything is in reach of the background.
+    """
+    spread = points[:, None].masked_fill(~members[..., None], torch.nan)  # (B, C, N, 2)
+    low = spread.nan_to_num(nan=torch.inf).amin(2)
+    high = spread.nan_to_num(nan=-torch.inf).amax(2)
+    extent = torch.linalg.vector_norm((high - low).clamp(min=0), dim=-1)  # (B, C)
+    nearest = torch.stack(
+        [squared_distances(points, points, members[:, c]).amin(-1) for c in range(members.shape[1])], dim=-1
+    ).sqrt()  # (B, N, C)
+    reach = nearest <= (REACH_EXTENT * extent + REACH_UNITS * unit[:, None])[:, None]
+    reach[..., 0] = True
+    return reach
+
+
+def nearest_association(
+    batch: ScanPairBatch, motions: Tensor, active: Tensor, reach: Tensor | None = None, gate: float = ASSOCIATION_GATE
+) -> Tensor:
+    """(B, N) target point that comes nearest under any possible motion, -1 beyond `gate` units of footprint and noise."""
+    possible = possible_clusters(active, reach, batch.source.shape[1])  # (B, N, D)
+    nearest = batch.source.new_full(batch.source.shape[:2], torch.inf)
+    index = torch.zeros_like(nearest, dtype=torch.int64)
+    for c in range(motions.shape[1]):
+        moved = se2.apply(motions[:, c], batch.source)
+        distance, place = squared_distances(moved, batch.target, batch.target_mask).min(-1)
+        nearer = possible[..., c] & (distance < nearest)
+        nearest, index = torch.where(nearer, distance, nearest), torch.where(nearer, place, index)
+    footprint = torch.linalg.vector_norm(batch.source, dim=-1) * FOOTPRINT
+    unit = footprint / 2 + 2 * batch.range_noise[:, None]
+    return index.masked_fill((nearest.sqrt() > gate * unit) | ~batch.source_mask, -1)

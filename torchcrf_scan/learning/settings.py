@@ -1,0 +1,268 @@
+"""."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+from torchcrf_scan.checks import choose, within
+from torchcrf_scan.config import ModelConfig
+from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.experiment.settings import ExperimentConfig
+
+
+@dataclass(frozen=True)
+class UnrolledConfig:
+    """The objective `unrolled`: losses on soft read-outs after a fixed number of rounds, at inferred motions.
+
+    Attributes:
+        iterations: rounds, always all of them.
+        temperature: of the read-out: log-beliefs (max-marginals, where `inference.temperature` is 0) are divided by it.
+        association: weight of the associations' cross-entropy.
+        cluster: weight of the clusters' cross-entropy.
+        rotation: weight of the motions' robust geodesic loss.
+        translation: weight of the motions' robust loss of where a cluster's centroid lands.
+        rotation_scale: radians; smaller errors count squared, larger ones by their logarithm.
+        translation_scale: metres (in the unit `spacing`, those of a street scanner), likewise.
+        detach_motion: no gradient passes through a motion into the features of the next pass.
+        deep_supervision: earlier rounds count too, each by this factor less than the next; 0: the last alone, 1: all alike.
+    """
+
+    iterations: int = 4
+    temperature: float = 1.0
+    association: float = 1.0
+    cluster: float = 1.0
+    rotation: float = 0.2
+    translation: float = 0.2
+    rotation_scale: float = 0.02
+    translation_scale: float = 0.1
+    detach_motion: bool = False
+    deep_supervision: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"iterations: expected at least 1, got {self.iterations}")
+        for name in ("temperature", "rotation_scale", "translation_scale"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite number above 0, got {getattr(self, name)}")
+        for name in ("association", "cluster", "rotation", "translation"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite weight of 0 or more, got {getattr(self, name)}")
+        if not 0 <= self.deep_supervision <= 1:
+            raise ValueError(f"deep_supervision: expected a factor between 0 and 1, got {self.deep_supervision}")
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """How the model is learned (spec 2, 6).
+
+    Attributes:
+        rotation_noise: radians of noise on the true motions.
+        translation_noise: metres of noise on the true motions.
+        objective: `pseudo_likelihood` (the paper's), or `likelihood`: the exact likelihood of each chain, without the former's
+            over-strong pairwise weights (spec 6.5); or `unrolled`: from the weights of pseudo-likelihood on through the unrolled
+            iterations, step by step (`gradient`).
+        disturbance: units of resolution by which training scans are skewed and bumped, as moving sensors do; 0: as they are.
+        start_share: share of the pairs whose features see InitialiseRT's motions instead.
+        predicted_share: share of the pairs whose clustering features see predicted associations (A-28). 0, the true ones, for
+            pseudo-likelihood: given its neighbours' true clusters a point learns little else, and movers then fade; a half suits
+            `likelihood`. CRF-Clustering alone always sees predicted ones.
+        folds: parts of the training pairs for out-of-fold margins; sequences stay whole. 0: margins on the same pairs (faithful).
+        negatives: wrong pairs per true one for the data booster.
+        booster_examples: examples that a booster sees at most, drawn at random; 0: all.
+        prior: standard deviation s_w of the weights' Gaussian prior, on standardised features.
+        max_steps: L-BFGS steps at most.
+        tolerance: gradient per node at which L-BFGS stops.
+        batch_size: pairs that are looked at at once.
+        seed: of everything drawn while learning.
+    """
+
+    objective: str = "pseudo_likelihood"
+    rotation_noise: float = 0.005
+    translation_noise: float = 0.02
+    disturbance: float = 0.7
+    start_share: float = 0.5
+    predicted_share: float = 0.0
+    folds: int = 4
+    negatives: int = 4
+    booster_examples: int = 5_000
+    prior: float = 10.0
+    max_steps: int = 200
+    tolerance: float = 1e-4
+    batch_size: int = 16
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        choose("objective", self.objective, ("pseudo_likelihood", "likelihood", "unrolled"))
+
+
+@dataclass(frozen=True)
+class AugmentConfig:
+    """How training pairs are varied as they are generated; 0 leaves a pair as it is.
+
+    Attributes:
+        mirror: share of the pairs that are mirrored, left for right.
+        dropout: largest share of the returns of a scan that are lost.
+        noise: largest noise that is added to the returns, in units of the sensor's own.
+        frame_rotation: radians by which the target's frame is turned, at most.
+        frame_translation: how far the target's frame is moved along x and y, at most; in units of the usual range of the target.
+    """
+
+    mirror: float = 0.5
+    dropout: float = 0.1
+    noise: float = 1.0
+    frame_rotation: float = 0.05
+    frame_translation: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name, most in (("mirror", 1.0), ("dropout", 0.9), ("noise", math.inf), ("frame_rotation", math.pi)):
+            within(f"gradient.augment.{name}", getattr(self, name), 0.0, most)
+        within("gradient.augment.frame_translation", self.frame_translation, 0.0, math.inf)
+
+    @classmethod
+    def nothing(cls) -> AugmentConfig:
+        """Pairs stay as they are."""
+        return cls(mirror=0.0, dropout=0.0, noise=0.0, frame_rotation=0.0, frame_translation=0.0)
+
+
+@dataclass(frozen=True)
+class GradientConfig:
+    """First-order training, which goes on from the staged fit or from `init`: AdamW on pairs that are generated on the fly.
+
+    Attributes:
+        objective: loss of the steps: `pseudo_likelihood`, `likelihood` (exact, of each chain at the start's motions) or
+            `unrolled`; `none`: no steps, the staged fit is all. With `learning.objective` unrolled it is `unrolled`.
+        steps: optimiser's steps at most.
+        batch_size: pairs of a step, of all processes together.
+        part: pairs that are looked at at once; a step's parts are shared out among the processes. Divides `batch_size`.
+        workers: processes that generate pairs, of every training process; 0: none beside it.
+        learning_rate: at its highest.
+        weight_decay: of AdamW.
+        warmup: steps until the learning rate is at its highest; after that it falls along a cosine.
+        final_rate: share of the highest learning rate that is left in the end.
+        clip: norm that gradients are cut to; 0: never.
+        amp: bfloat16 where the device is a GPU that has it (torch.autocast); a CPU always calculates in full precision.
+        device: `auto` (a GPU where there is one), `cpu` or `cuda`.
+        worlds: names of the simulated `WORLDS` that pairs are drawn from.
+        fresh: share of the pairs that are simulated on the fly; the others are drawn from the training pairs.
+        validation: share of the training pairs, in whole sequences, that nothing is fitted on; 0: no validation, and the last
+            weights are kept instead of the best.
+        validate_every: steps between two looks at the validation pairs.
+        patience: looks without a better loss after which training stops early; 0: never.
+        checkpoint_every: steps between two checkpoints.
+        graph: draw the module's graph in TensorBoard, which takes some seconds.
+        seed: of everything drawn: pair k of a run is a function of (seed, k) alone.
+    """
+
+    objective: str = "none"
+    steps: int = 200
+    batch_size: int = 8
+    part: int = 4
+    workers: int = 1
+    learning_rate: float = 0.01
+    weight_decay: float = 0.0
+    warmup: int = 10
+    final_rate: float = 0.05
+    clip: float = 1.0
+    amp: bool = False
+    device: str = "auto"
+    worlds: tuple[str, ...] = ("street",)
+    fresh: float = 1.0
+    validation: float = 0.25
+    validate_every: int = 20
+    patience: int = 5
+    checkpoint_every: int = 20
+    graph: bool = True
+    seed: int = 0
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+
+    def __post_init__(self) -> None:
+        choose("gradient.objective", self.objective, ("none", "pseudo_likelihood", "likelihood", "unrolled"))
+        choose("gradient.device", self.device, ("auto", "cpu", "cuda"))
+        for world in self.worlds:
+            choose("gradient.worlds", world, tuple(WORLDS))
+        for name in ("steps", "batch_size", "part", "validate_every", "checkpoint_every"):
+            within(f"gradient.{name}", getattr(self, name), 1, math.inf)
+        for name in ("workers", "weight_decay", "warmup", "clip", "patience", "seed"):
+            within(f"gradient.{name}", getattr(self, name), 0, math.inf)
+        for name in ("final_rate", "fresh"):
+            within(f"gradient.{name}", getattr(self, name), 0.0, 1.0)
+        if not 0 < self.learning_rate < math.inf:
+            raise ValueError(f"gradient.learning_rate: expected more than 0, got {self.learning_rate}")
+        if not 0 <= self.validation < 1:
+            raise ValueError(f"gradient.validation: expected a share in [0, 1), got {self.validation}")
+        if self.batch_size % self.part:
+            raise ValueError(f"gradient.part: expected a divisor of batch_size = {self.batch_size}, got {self.part}")
+        if self.fresh > 0 and not self.worlds:
+            raise ValueError(f"gradient.worlds: expected at least one with gradient.fresh = {self.fresh}, got none")
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """Where annotated pairs come from: files, the simulator, or both.
+
+    Attributes:
+        train: a file, folder or glob pattern of training pairs, or a list of them.
+        test: the same for test pairs.
+        simulate_train: names of simulated `WORLDS` to train on too, `pairs` pairs each. For other worlds, `torchcrf-scan simulate`
+            writes files.
+        simulate_test: names of simulated `WORLDS` to test on too; train and test never share a seed.
+        pairs: pairs of every simulated world.
+        sequences: sequences of every simulated world.
+        seed: of the simulator.
+    """
+
+    train: tuple[str, ...] | str = ()
+    test: tuple[str, ...] | str = ()
+    simulate_train: tuple[str, ...] = ("street",)
+    simulate_test: tuple[str, ...] = ("street",)
+    pairs: int = 31
+    sequences: int = 8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("simulate_train", "simulate_test"):
+            for world in getattr(self, name):
+                choose(name, world, tuple(WORLDS))
+
+
+@dataclass(frozen=True)
+class Config:
+    """One run of `train.py` or of `torchcrf-scan experiment`.
+
+    Attributes:
+        experiment: what `torchcrf-scan experiment` does; `train.py` does not look at it.
+        output: run folder; resolved config, versions, model, metrics, events and pictures go there.
+        overfit: train and test on the first training pair alone, a quick check that everything can learn.
+        compare_chains: also fit and evaluate CRF-Matching and CRF-Clustering alone.
+        init: a model, as a folder or by the name of a shipped one, whose weights first-order training begins with; none: it begins
+            with those of the staged fit.
+    """
+
+    data: DataConfig = field(default_factory=DataConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    learning: LearningConfig = field(default_factory=LearningConfig)
+    gradient: GradientConfig = field(default_factory=GradientConfig)
+    unrolled: UnrolledConfig = field(default_factory=UnrolledConfig)
+    experiment: ExperimentConfig = field(default_factory=ExperimentConfig)
+    output: str = "runs/default"
+    overfit: bool = False
+    compare_chains: bool = True
+    init: str = ""
+
+    def __post_init__(self) -> None:
+        other = self.gradient.objective
+        if self.learning.objective == "unrolled" and other not in ("none", "unrolled"):
+            raise ValueError(f"gradient.objective: expected unrolled with learning.objective unrolled, got {other}")
+        if self.init and self.first_order == "none":
+            raise ValueError(f"init: expected a gradient.objective to go on with from {self.init}, got none")
+
+    @property
+    def first_order(self) -> str:
+        """The loss of first-order training: `none`, or one of `GradientConfig.objective`."""
+        return "unrolled" if self.learning.objective == "unrolled" else self.gradient.objective
+
+    @property
+    def staged(self) -> LearningConfig:
+        """How the staged fit learns: what goes on through the unrolled iterations begins with pseudo-likelihood."""
+        return replace(self.learning, objective="pseudo_likelihood") if self.learning.objective == "unrolled" else self.learning

@@ -1,0 +1,49 @@
+"""Angles on a circle and places on a rising scale of bearings."""
+
+from __future__ import annotations
+
+import math
+
+from torchcrf_scan.loops.jit import Array, kernel
+
+BACKWARDS = 1e-4  # radians; a step back by so little is no turn
+
+
+@kernel
+def rising_turn(difference: float) -> float:
+    """Counter-clockwise angle in [0, 2 pi); a step back by rounding is no turn."""
+    return max((difference + BACKWARDS) % (2 * math.pi) - BACKWARDS, 0.0)
+
+
+@kernel
+def turn_apart(difference: float) -> float:
+    """`rising_turn` without a division where there are no whole turns to take off; not to the last digit."""
+    return max(difference, 0.0) if -BACKWARDS <= difference < 6.0 else rising_turn(difference)
+
+
+@kernel
+def within_circle(angle: float) -> float:
+    """angle % (2 pi), which it seldom takes a division for."""
+    if angle < 0:
+        angle += 2 * math.pi
+    return angle if 0 <= angle < 2 * math.pi else angle % (2 * math.pi)
+
+
+@kernel
+def turn_between(before: float, after: float) -> float:
+    """`rising_turn` from one bearing to another."""
+    return max(within_circle(after - before + BACKWARDS) - BACKWARDS, 0.0)
+
+
+@kernel
+def first_from(rising: Array, value: float) -> int:
+    """Index of the first entry that is not below the value; their number where all are."""
+    low, count = 0, len(rising)
+    while count > 0:
+        half = count // 2
+        if rising[low + half] < value:
+            low += half + 1
+            count -= half + 1
+        else:
+            count = half
+    return low

@@ -1,0 +1,90 @@
+"""The start of one pair from what was surveyed; `inference.initialise.choose` in loops."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from torchcrf_scan.inference.start import ASSOCIATION_GATE, FOOTPRINT, REACH_EXTENT, REACH_UNITS
+from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.nearest import box_distance
+from torchcrf_scan.loops.pair import PairStart
+from torchcrf_scan.search.accept import Score, box_round, probabilities_of, select
+from torchcrf_scan.search.grid import ScanGrid, locate
+from torchcrf_scan.search.hypotheses import Hypotheses
+from torchcrf_scan.search.leftover import Leftover
+from torchcrf_scan.search.registration import carry
+
+CONSIDERED = 0.1  # probability from which a mover is considered; the score alone accepts from its own threshold
+FEWEST_POINTS = 3  # a scan with fewer says nothing of the motion
+CERTAIN = 1e-6  # probabilities are kept this far from 0 and 1
+
+
+@kernel
+def choose_movers(
+    leftover: Leftover, guess: Array, hypotheses: Hypotheses, features: Array, score: Score, clusters: int, resolution: float
+) -> PairStart:
+    """The background and the up to `clusters` - 1 movers that the score accepts.
+
+    Args:
+        guess: (3,) the pair's initial motion, of clusters that are not there and of a scan with too few points.
+        features: (H, F). resolution: metres, `features.potentials.resolution` of the pair.
+    """
+    source, target, tangent = leftover.source.grid.scan.points, leftover.target.grid, leftover.target.grid.scan.tangent
+    noise, (start, index), group = leftover.source.grid.scan.noise, hypotheses.groups, hypotheses.group
+    motions, active = np.empty((clusters, 3)), np.zeros(clusters, np.bool_)
+    log_odds, reach = np.full(clusters, -np.inf), np.zeros((len(source), clusters), np.bool_)
+    motions[:] = guess
+    active[0], log_odds[0], reach[:, 0] = True, np.inf, True
+    if min(len(source), len(tangent)) < FEWEST_POINTS:
+        return PairStart(motions, active, _associate(source, target, motions, active, reach, noise), 0 * tangent, reach, log_odds)
+    motions[0] = leftover.background
+    probabilities = probabilities_of(score, features)
+    for c, h in enumerate(select(leftover, hypotheses, probabilities, CONSIDERED, clusters - 1), 1):
+        motions[c] = hypotheses.motions[h]
+        active[c] = probabilities[h] >= score.threshold
+        sure = min(max(probabilities[h], CERTAIN), 1 - CERTAIN)
+        log_odds[c] = math.log(sure / (1 - sure))
+        _reach(source, index[start[group[h]] : start[group[h] + 1]], resolution, reach[:, c])
+    return PairStart(motions, active, _associate(source, target, motions, active, reach, noise), tangent, reach, log_odds)
+
+
+@kernel
+def _reach(points: Array, members: Integers, unit: float, is_near: Booleans) -> None:
+    """Writes which points (N,) may belong to the object of these members: within half its extent and a few units of them."""
+    box = np.empty(4)
+    box_round(points, members, box)
+    wide, high = box[2] - box[0], box[3] - box[1]
+    reach = REACH_EXTENT * math.sqrt(wide * wide + high * high) + REACH_UNITS * unit
+    last = 0  # member that was near enough to the point before
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        if box_distance(box, x, y) > reach * reach:
+            continue
+        for k in range(len(members)):
+            j = members[(last + k) % len(members)]
+            dx, dy = points[j, 0] - x, points[j, 1] - y
+            if dx * dx + dy * dy <= reach * reach:
+                is_near[i], last = True, (last + k) % len(members)
+                break
+
+
+@kernel
+def _associate(source: Array, target: ScanGrid, motions: Array, active: Booleans, reach: Booleans, noise: float) -> Integers:
+    """(N,) target point that comes nearest under any possible motion, -1 beyond a few units of footprint and noise."""
+    N = len(source)
+    association, least = np.full(N, -1, np.int64), np.empty(N)
+    for i in range(N):
+        gate = ASSOCIATION_GATE * (math.sqrt(source[i, 0] ** 2 + source[i, 1] ** 2) * FOOTPRINT / 2 + 2 * noise)
+        least[i] = np.nextafter(gate * gate, np.inf)  # the gate itself is near enough
+    moved, squared, near = np.empty((2, N)), np.empty(N), np.empty(N, np.int64)
+    for c in range(len(motions)):
+        if not active[c]:
+            continue
+        carry(motions[c], source, moved)
+        locate(moved, target, squared, near)
+        for i in range(N):
+            if reach[i, c] and squared[i] < least[i]:
+                least[i], association[i] = squared[i], near[i]
+    return association

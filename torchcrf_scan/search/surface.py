@@ -1,0 +1,135 @@
+"""One scan seen as pieces of surface; `inference.surface` in loops, and the free-space test of single points."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from torchcrf_scan.features.free_space import SLACK_SHARE, SLACK_STEPS, WIDEST_GAP
+from torchcrf_scan.loops.circle import rising_turn, turn_apart
+from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.median import lower_median
+from torchcrf_scan.loops.nearest import Boxes, boxes_of
+
+GRAZING = math.radians(10.0)  # a surface met at a flatter angle looks like a depth jump (adaptive breakpoint detector)
+WIDEST_TURN = GRAZING * (1 - 1e-4)  # between neighbours on a surface; beams are whole steps apart, and just `GRAZING` is too far
+
+AGREES, SEEN_THROUGH, OCCLUDED, UNMEASURED = 0, 1, 2, 3  # what a beam says of a point
+
+
+class Surface(NamedTuple):
+    """A scan of P points with its geometry; the attributes are those of `inference.surface.Surface`."""
+
+    boxes: Boxes
+    points: Array
+    origin: Array
+    ranges: Array
+    bearings: Array
+    spacing: Array
+    tangent: Array
+    length: Array
+    segment: Integers
+    step: float
+    noise: float
+    is_closed: bool
+
+
+@kernel
+def number_runs(joined: Booleans) -> Integers:
+    """(P,) numbers from 0; joined[i] says that i and i + 1 have the same, the last and the first included."""
+    number = np.zeros(len(joined), np.int64)
+    for i in range(1, len(joined)):
+        number[i] = number[i - 1] + (0 if joined[i - 1] else 1)
+    if joined[-1]:
+        last = number[-1]
+        for i in range(len(joined)):
+            if number[i] == last:
+                number[i] = 0
+    return number
+
+
+@kernel
+def surface_of(points: Array, noise: float, is_closed: bool, origin: Array) -> Surface:
+    """points: (P, 2) in beam order, P >= 1; noise: metres; origin: (2,) of the sensor."""
+    P = len(points)
+    ranges, bearings, turn = np.empty(P), np.empty(P), np.empty(P)
+    raw = np.empty(P)
+    for i in range(P):
+        x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
+        ranges[i] = math.sqrt(x * x + y * y)
+        raw[i] = math.atan2(y, x)
+    bearings[0] = raw[0]
+    for i in range(1, P):
+        bearings[i] = bearings[i - 1] + rising_turn(raw[i] - raw[i - 1])
+    gap = np.empty(P)
+    for i in range(P):
+        j = (i + 1) % P
+        gap[i] = math.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
+        turn[i] = rising_turn(bearings[j] - bearings[i])
+    step = lower_median(turn[:-1]) if P > 1 else math.radians(0.5)
+    joined = np.empty(P, np.bool_)
+    for i in range(P):
+        least = min(ranges[i], ranges[(i + 1) % P])
+        largest = least * math.sin(turn[i]) / math.sin(max(GRAZING - turn[i], 1e-3)) + 6 * noise
+        joined[i] = gap[i] <= largest and turn[i] < WIDEST_TURN
+    if not is_closed:
+        joined[P - 1] = False
+    spacing, length, tangent = np.empty(P), np.empty(P), np.empty((P, 2))
+    for i in range(P):
+        j, k = (i + 1) % P, (i - 1) % P
+        footprint = ranges[i] * step
+        nearest = min(gap[i] if joined[i] else np.inf, gap[k] if joined[k] else np.inf)
+        spacing[i] = nearest if nearest < np.inf else footprint
+        ax = ay = 0.0
+        length[i] = 0.0
+        if joined[i]:
+            ax, ay = ax + points[j, 0] - points[i, 0], ay + points[j, 1] - points[i, 1]
+        if joined[k]:
+            ax, ay = ax + points[i, 0] - points[k, 0], ay + points[i, 1] - points[k, 1]
+        length[i] = (gap[i] if joined[i] else footprint) / 2 + (gap[k] if joined[k] else footprint) / 2
+        arm = max(math.sqrt(ax * ax + ay * ay), 1e-9)
+        tangent[i, 0], tangent[i, 1] = ax / arm, ay / arm
+    segment = number_runs(joined)
+    return Surface(boxes_of(points), points, origin, ranges, bearings, spacing, tangent, length, segment, step, noise, is_closed)
+
+
+@kernel
+def bearing_of(scan: Surface, dx: float, dy: float) -> float:
+    """The direction of (dx, dy) as a number on the scale of the scan's rising bearings."""
+    first, half = scan.bearings[0], scan.step / 2
+    turned = math.atan2(dy, dx) - first + half
+    if not 0 <= turned < 2 * math.pi:
+        turned %= 2 * math.pi
+    return first + turned - half
+
+
+@kernel
+def look_between(scan: Surface, bearing: float, after: int, reach: float) -> int:
+    """What the beams `after` - 1 and `after`, between which a bearing lies, say of a point there that is `reach` metres away."""
+    M, half = len(scan.ranges), scan.step / 2
+    if not scan.is_closed and bearing > scan.bearings[M - 1] + half:
+        return OCCLUDED
+    left, right = max(after - 1, 0), min(after, M - 1)
+    if scan.is_closed:
+        left, right = (after - 1 if after > 0 else M - 1), (after if after < M else 0)
+    apart = max(turn_apart(bearing - scan.bearings[left]), turn_apart(scan.bearings[right] - bearing))
+    if left == right:
+        apart = min(apart, half)
+    if not apart < WIDEST_GAP * scan.step:
+        return UNMEASURED
+    slack = SLACK_STEPS * (scan.noise + reach * scan.step) + SLACK_SHARE * reach
+    if reach + slack < min(scan.ranges[left], scan.ranges[right]):
+        return SEEN_THROUGH
+    if reach > max(scan.ranges[left], scan.ranges[right]) + slack:
+        return OCCLUDED
+    return AGREES
+
+
+@kernel
+def look_along(scan: Surface, x: float, y: float) -> int:
+    """Free-space test (design finding 13) of a point carried into the frame of `scan`: one of the four answers above."""
+    dx, dy = x - scan.origin[0], y - scan.origin[1]
+    bearing = bearing_of(scan, dx, dy)
+    return look_between(scan, bearing, int(np.searchsorted(scan.bearings, bearing)), math.sqrt(dx * dx + dy * dy))

@@ -1,0 +1,37 @@
+"""What the scans of one pair say before anything learned is asked; it costs nearly all the time of InitialiseRT."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from torchcrf_scan.loops.jit import Array
+from torchcrf_scan.loops.pair import Pair
+from torchcrf_scan.search.grid import ScanGrid, grid_of
+from torchcrf_scan.search.hypotheses import Hypotheses, hypothesise
+from torchcrf_scan.search.hypothesis_features import hypothesis_features
+from torchcrf_scan.search.leftover import Leftover, leftover_of
+from torchcrf_scan.search.surface import surface_of
+
+
+class Survey(NamedTuple):
+    """The background's motion with what it leaves open, H motions that movers may have, and (H, F) features to judge them by."""
+
+    leftover: Leftover
+    hypotheses: Hypotheses
+    features: Array
+
+
+def grids_of(pair: Pair) -> tuple[ScanGrid, ScanGrid]:
+    """Source and target, of at least one point each, as others are registered on them."""
+    source = surface_of(pair.source, pair.noise, pair.source_closed, np.zeros(2))
+    target = surface_of(pair.target, pair.noise, pair.target_closed, pair.target_origin)
+    return grid_of(source), grid_of(target)
+
+
+def survey_at(source: ScanGrid, target: ScanGrid, background: Array, dt: float) -> Survey:
+    """What a motion of the background (3,) leaves, and what may have moved. dt: seconds."""
+    leftover = leftover_of(source, target, background)
+    hypotheses = hypothesise(leftover, dt)
+    return Survey(leftover, hypotheses, hypothesis_features(leftover, hypotheses))

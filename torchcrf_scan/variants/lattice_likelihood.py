@@ -1,0 +1,118 @@
+"""How likely the annotation is to the lattice: super-node by super-node, and exactly (spec 6.2, 6.5, 7.7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchcrf_scan.config import InferenceConfig
+from torchcrf_scan.features.candidates import with_targets
+from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, find_candidates, possible_clusters
+from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales
+from torchcrf_scan.inference.pseudo_likelihood import Design, PlugIns, at_true_neighbours, beside_true_neighbours
+from torchcrf_scan.inference.state import Parameters
+from torchcrf_scan.variants.lattice import lattice_log_partition
+from torchcrf_scan.variants.lattice_features import (
+    ASSOCIATION_PAIRWISE,
+    CLUSTER_PAIRWISE,
+    ELASTIC_KINDS,
+    ELASTIC_WEIGHTS,
+    MOVING_WEIGHTS,
+    STATIC_WEIGHTS,
+    LatticeFeatures,
+    LatticePotentials,
+    lattice_features,
+    transition_kinds,
+)
+
+WEIGHTS = len(ASSOCIATION_WEIGHTS) + len(CLUSTERING_WEIGHTS)
+
+
+@dataclass(frozen=True, slots=True)
+class LatticeChain(LatticeFeatures):
+    """The lattice's features and the truth; what `pseudo_likelihood.Chain` is to one chain.
+
+    Attributes:
+        association, cluster: (B, N) true states, the outliers last.
+        known: (B, N) nodes both of whose labels count; the others cut the chain.
+        axes, labels: as in `pseudo_likelihood.Chain`; a association states, d clusters.
+    """
+
+    axes: ClassVar[dict[str, str]] = {
+        **{"static": "na", "moving": "nad", "mask": "nad"},
+        **{"pairwise_association": "eaa", "elastic": "eaa", "pairwise_cluster": "edd"},
+        **{"association": "n", "cluster": "n", "known": "n"},
+    }
+    labels: ClassVar[dict[str, str]] = {"association": "a", "cluster": "d"}
+
+    association: Tensor
+    cluster: Tensor
+    known: Tensor
+
+    def design(self) -> Design:
+        """The 43 features of every super-node at its true neighbours; state (j, k) is j D + k."""
+        D = self.mask.shape[3]
+        features = self.moving.new_zeros(*self.mask.shape, WEIGHTS)
+        features[..., list(STATIC_WEIGHTS)] = self.static[:, :, :, None]
+        features[..., list(MOVING_WEIGHTS)] = self.moving
+        of_association = at_true_neighbours(self.pairwise_association, self.association, self.known)
+        features[..., ASSOCIATION_PAIRWISE] = of_association[:, :, :, None]
+        of_cluster = at_true_neighbours(self.pairwise_cluster, self.cluster, self.known)
+        features[..., CLUSTER_PAIRWISE] = of_cluster[:, :, None]
+        features[..., ELASTIC_WEIGHTS] = self._elastic_at_true_neighbours()
+        return Design(features.flatten(2, 3), self.mask.flatten(2), self.association * D + self.cluster, self.known)
+
+    def _elastic_at_true_neighbours(self) -> Tensor:
+        """(B, N, A, D, 3): the only features of both labels and both labels of a neighbour."""
+        D = self.mask.shape[3]
+        by_kind = self.elastic.new_tensor(ELASTIC_KINDS).T[transition_kinds(D, self.mask.device)]  # (D, D, 3)
+        by_kind = by_kind.expand(*self.elastic.shape[:2], D, D, 3)
+        of_association = beside_true_neighbours(self.elastic, self.association, self.known)
+        of_cluster = beside_true_neighbours(by_kind, self.cluster, self.known)
+        return sum(a[:, :, :, None] * c[:, :, None] for a, c in zip(of_association, of_cluster, strict=True))  # type: ignore[return-value]
+
+    def log_likelihood(self, weights: Tensor) -> Tensor:
+        """(B,) exact log p(both true labellings | observation). weights: (43,)."""
+        potentials = self.potentials(weights).cut(self.known)
+        return self._score(potentials) - lattice_log_partition(potentials)
+
+    def _score(self, potentials: LatticePotentials) -> Tensor:
+        """(B,) score of the truth."""
+        A, D = self.mask.shape[2:]
+        j, k = self.association, self.cluster
+        kind = transition_kinds(D, k.device)[k[:, :-1], k[:, 1:]]
+        states = (
+            (potentials.log_unary.flatten(2), j * D + k),
+            (potentials.log_association.flatten(2), (j[:, :-1] * A + j[:, 1:]) * 3 + kind),
+            (potentials.log_cluster.flatten(2), k[:, :-1] * D + k[:, 1:]),
+        )
+        return torch.stack([values.gather(-1, state[..., None]).sum((1, 2)) for values, state in states]).sum(0)
+
+
+def lattice_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> LatticeChain:
+    """The lattice at the plug-ins' motions; of the other plug-ins it needs only the true clusters.
+
+    States are the candidates of the decoding and the truth, times the clusters.
+    """
+    batch, truth = view.batch, view.batch.truth
+    assert truth is not None
+    found = find_candidates(view, plugins.motions, plugins.active, config)
+    index, mask, association = with_targets(found.index, found.mask, truth.association)
+    states = AssociationStates.of(view, index, mask, scales, boosters)
+    possible = possible_clusters(plugins.active, plugins.reach, index.shape[1])
+    features = lattice_features(view, states, plugins.motions, found.nearest, possible, scales, boosters)
+    return LatticeChain(
+        **{f.name: getattr(features, f.name) for f in fields(LatticeFeatures)},
+        association=association,
+        cluster=torch.where(plugins.label >= 0, plugins.label, plugins.motions.shape[1]),
+        known=truth.known & plugins.known & batch.source_mask,
+    )
+
+
+def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Parameters, config: InferenceConfig) -> Tensor:
+    """(B,) sum over super-nodes."""
+    design = lattice_chain(view, plugins, parameters.scales, parameters.boosters, config).design()
+    return design.log_likelihood(torch.cat([parameters.association, parameters.clustering])).sum(-1)
