@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -114,12 +114,12 @@ def _start(tree: Path, model: str, files: Sequence[Path]) -> subprocess.Popen[st
 def _ask(process: subprocess.Popen[str], task: str, turn: int) -> float:
     assert process.stdin is not None
     assert process.stdout is not None
-    try:
+    with suppress(BrokenPipeError):  # told below
         process.stdin.write(f"{task} {turn}\n")
         process.stdin.flush()
-    except BrokenPipeError:
-        pass  # told below
     answer = process.stdout.readline()
     if not answer:
+        with suppress(BrokenPipeError):
+            process.stdin.close()
         raise ValueError(f"--beside: expected a time of {task}, got a process that ended with {process.wait()}")
     return float(answer)

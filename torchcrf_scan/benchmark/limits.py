@@ -1,8 +1,8 @@
 """The limit: operations and bytes that a whole pair needs at least, and the time that this machine would take for them.
 
-An operation is an addition, a product, a comparison, a look-up, a root, a quotient or a trigonometric function alike, at the rate of a
-matrix product: no program gets there. Bytes are those of the tables that are written and read, as if they went to memory and came back.
-Nearest points are found through boxes round runs of neighbours, not by N M distances.
+An operation is an addition, a product, a comparison, a look-up, a root, a quotient or a trigonometric function alike, at the rate
+of a matrix product: no program gets there. Bytes are those of the tables that are written and read, as if they went to memory and
+came back. Nearest points are found through boxes round runs of neighbours, not by N M distances.
 """
 
 from __future__ import annotations
