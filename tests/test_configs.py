@@ -10,11 +10,12 @@ from jsonargparse import ArgumentParser
 from support import PAPER_WEIGHTS
 
 from torchcrf_scan.commands.experiment import read_variants
-from torchcrf_scan.config import WEIGHTS, FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.experiment.settings import ExperimentConfig
 from torchcrf_scan.features.scales import live_weights
 from torchcrf_scan.learning.settings import Config, LearningConfig
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import WEIGHTS
 
 PAPER = FeatureConfig(free_space=False, decisions=False, left_out=())
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"

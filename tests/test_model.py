@@ -24,9 +24,9 @@ from torchcrf_scan import (
 )
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 
 ASSOCIATION = (
     *("dist1", "dist3", "dist5", "angle1", "angle3", "angle5", "geo1", "geo3", "geo5"),

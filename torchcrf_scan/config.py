@@ -6,13 +6,12 @@ import math
 from dataclasses import dataclass, field
 
 from torchcrf_scan.checks import choose, within
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
+from torchcrf_scan.names import WEIGHTS
 
 LEFT_OUT = (
     *("association.pairwise_distance", "association.pairwise_translation"),
     *("clustering.gate", "clustering.outlier_bias"),
 )  # by default
-WEIGHTS = (*(f"association.{name}" for name in ASSOCIATION_WEIGHTS), *(f"clustering.{name}" for name in CLUSTERING_WEIGHTS))
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,13 @@ from torchcrf_scan.fast.decode import learned_of, settings_of
 from torchcrf_scan.fast.pairs import by_beam, decode_pairs, extras_of, predict
 from torchcrf_scan.features.learned import EMBEDDING_WEIGHTS, Embeddings, ExtraLogUnary, LearnedInputs
 from torchcrf_scan.features.potentials import Boosters, PairView
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales, has_weight, live_weights
+from torchcrf_scan.features.scales import Scales, has_weight, live_weights
 from torchcrf_scan.inference import joint, pseudo_likelihood
-from torchcrf_scan.inference.selection import ClusterPotential
 from torchcrf_scan.inference.start import Start
-from torchcrf_scan.inference.state import Parameters
+from torchcrf_scan.inference.state import ClusterPotential, Parameters
 from torchcrf_scan.inference.uncertainty import Calibration
 from torchcrf_scan.loops.pair import pair_of_scans
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.pretrained import PRETRAINED, find_weights, model_config
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair

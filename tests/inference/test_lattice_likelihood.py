@@ -16,7 +16,7 @@ from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, find_candidates, possible_clusters
-from torchcrf_scan.features.scales import LOCAL_CHANNELS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.learning.fit import Lesson, fit_lattice
@@ -24,6 +24,7 @@ from torchcrf_scan.learning.plugins import training_plugins
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.learning.weights_fit import fit_chain, flatten, stack
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import LOCAL_CHANNELS
 from torchcrf_scan.variants.lattice_features import LatticeFeatures, lattice_features
 from torchcrf_scan.variants.lattice_likelihood import LatticeChain, lattice_chain, pseudo_log_likelihood
 

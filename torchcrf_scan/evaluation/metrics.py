@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from rapidfuzz.distance import Levenshtein
 
-from torchcrf_scan.counterparts import match_movers, relabel
 from torchcrf_scan.evaluation.calibration import Sureness
+from torchcrf_scan.evaluation.counterparts import match_movers, relabel
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 

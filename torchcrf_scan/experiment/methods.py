@@ -22,7 +22,6 @@ from torchcrf_scan.baselines.ransac import match_ransac
 from torchcrf_scan.baselines.start import label_nearest
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import EncoderConfig, ModelConfig
-from torchcrf_scan.features.scales import LOCAL_CHANNELS
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.inference.start import Start, nearest_association
 from torchcrf_scan.learning.calibration_fit import calibrate
@@ -36,6 +35,7 @@ from torchcrf_scan.learning.ranks import ALONE
 from torchcrf_scan.learning.selection_fit import fit_potential
 from torchcrf_scan.learning.settings import Config, LearningConfig
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import LOCAL_CHANNELS
 from torchcrf_scan.scan import Floats, PairPrediction, ScanPair
 
 JOINT, EXACT = "joint", "joint, exact likelihood"

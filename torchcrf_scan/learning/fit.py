@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcrf_scan.features.potentials import Boosters, PairView
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS, live_weights
+from torchcrf_scan.features.scales import live_weights
 from torchcrf_scan.inference import joint, pseudo_likelihood
 from torchcrf_scan.inference.pseudo_likelihood import Chain, PlugIns
 from torchcrf_scan.inference.start import Start
@@ -25,6 +25,7 @@ from torchcrf_scan.learning.selection_fit import fit_potential
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.learning.weights_fit import Watch, fit_chain
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS
 from torchcrf_scan.variants.lattice_likelihood import lattice_chain
 
 Margins = dict[int, Boosters]  # by out-of-fold part, boosters that have not seen it

@@ -19,13 +19,13 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.evaluation.calibration import Sureness
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.evaluation.summary import summarise
-from torchcrf_scan.features.scales import LOCAL_CHANNELS
 from torchcrf_scan.inference import joint, pseudo_likelihood
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.graph import write_graph
 from torchcrf_scan.learning.run_log import write_settings
 from torchcrf_scan.learning.settings import Config
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import LOCAL_CHANNELS
 from torchcrf_scan.viz.curves import plot_confidence, plot_precision_recall, plot_reliability
 from torchcrf_scan.viz.plots import plot_associations, plot_clusters
 

@@ -10,10 +10,11 @@ from torch import Tensor
 from torchcrf_scan.features import association
 from torchcrf_scan.features.candidates import squared_distances
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, association_unary
-from torchcrf_scan.features.scales import LOCAL_CHANNELS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.pseudo_likelihood import PlugIns
+from torchcrf_scan.names import LOCAL_CHANNELS
 
 FLOOR = 0.02  # metres and radians
 CLUSTER_FLOOR = 0.05  # metres

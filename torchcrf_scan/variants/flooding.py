@@ -28,13 +28,13 @@ from torchcrf_scan.features.potentials import (
     registered_points,
     state_mask,
 )
-from torchcrf_scan.features.scales import ASSOCIATION_UNARY
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.inference import joint
 from torchcrf_scan.inference.messages import normalise, reduce_states
 from torchcrf_scan.inference.motion import RunningSums, retire_empty
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters, State
+from torchcrf_scan.names import ASSOCIATION_UNARY
 from torchcrf_scan.prediction import Prediction
 
 MESSAGE_TOLERANCE = 1e-3

@@ -18,16 +18,10 @@ from torchcrf_scan.features import association, clustering
 from torchcrf_scan.features.extension import association_extension, clustering_extension
 from torchcrf_scan.features.free_space import FreeSpace, look
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, state_mask, unary_at
-from torchcrf_scan.features.scales import (
-    ASSOCIATION_UNARY,
-    ASSOCIATION_WEIGHTS,
-    CLUSTERING_UNARY,
-    STATIC_CHANNELS,
-    Scales,
-    robust_square,
-)
+from torchcrf_scan.features.scales import Scales, robust_square
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.names import ASSOCIATION_UNARY, ASSOCIATION_WEIGHTS, CLUSTERING_UNARY, STATIC_CHANNELS
 
 # Where the features' weights are among all, association before clustering.
 FIRST_CLUSTERING = len(ASSOCIATION_WEIGHTS)

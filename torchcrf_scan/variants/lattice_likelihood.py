@@ -11,9 +11,10 @@ from torch import Tensor
 from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features.candidates import with_targets
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, find_candidates, possible_clusters
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.pseudo_likelihood import Design, PlugIns, at_true_neighbours, beside_true_neighbours
 from torchcrf_scan.inference.state import Parameters
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.variants.lattice import lattice_log_partition
 from torchcrf_scan.variants.lattice_features import (
     ASSOCIATION_PAIRWISE,

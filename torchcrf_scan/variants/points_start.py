@@ -9,13 +9,13 @@ from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.candidates import by_motion
 from torchcrf_scan.features.potentials import PairView, possible_clusters
-from torchcrf_scan.features.scales import CLUSTERING_UNARY
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
 from torchcrf_scan.inference.messages import chain_beliefs
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters
+from torchcrf_scan.names import CLUSTERING_UNARY
 from torchcrf_scan.variants.paper_start import FEWEST, match_cold
 
 PAPERS_UNARY = 4  # C1..C4; the extensions are not for so many clusters
