@@ -26,9 +26,10 @@ from torchcrf_scan.experiment.methods import (
     with_config,
     with_motions_given,
 )
+from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.learning.calibration_fit import calibrate
-from torchcrf_scan.learning.settings import Config, GradientConfig
+from torchcrf_scan.learning.settings import GradientConfig
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
@@ -106,7 +107,7 @@ def test_true_motions_and_true_associations_stay(answers: dict[str, Answer], sma
 
 
 def test_the_joint_model_alone_is_the_same_model(
-    study: Study, models: Models, small_pairs: list[ScanPair], small_config: Config
+    study: Study, models: Models, small_pairs: list[ScanPair], small_config: RunConfig
 ) -> None:
     config = replace(small_config, experiment=replace(small_config.experiment, joint_alone=True))
     alone = fit_models(study, range(4), config, variants=True)
@@ -129,7 +130,7 @@ def test_the_joint_models_share_their_features(models: Models) -> None:
 
 
 def test_a_model_with_an_encoder_goes_on_from_the_joint_model(
-    study: Study, models: Models, small_pairs: list[ScanPair], small_config: Config
+    study: Study, models: Models, small_pairs: list[ScanPair], small_config: RunConfig
 ) -> None:
     config = replace(
         small_config,
@@ -151,7 +152,7 @@ def test_a_model_with_an_encoder_goes_on_from_the_joint_model(
         fit_models(study, range(4), replace(config, gradient=GradientConfig()), variants=False)
 
 
-def test_every_joint_model_is_calibrated_on_what_it_was_fitted_on(study: Study, models: Models, small_config: Config) -> None:
+def test_every_joint_model_is_calibrated_on_what_it_was_fitted_on(study: Study, models: Models, small_config: RunConfig) -> None:
     """The fold's own pairs alone: a second calibration on them changes nothing."""
     for name, model in models.joint.items():
         again = copy.deepcopy(model)
@@ -170,7 +171,7 @@ def test_a_lattice_may_be_the_joint_model(models: Models, small_pairs: list[Scan
     assert joint_rows(answer(lattice, small_pairs[4])) == [JOINT, *ORACLES]
 
 
-def test_flooding_has_no_lattice_and_holds_true_motions_by_the_sweep(study: Study, small_config: Config) -> None:
+def test_flooding_has_no_lattice_and_holds_true_motions_by_the_sweep(study: Study, small_config: RunConfig) -> None:
     inference = replace(small_config.model.inference, schedule="flooding", iterations=1)  # no answer counts here
     config = replace(small_config, model=replace(small_config.model, inference=inference))
     flooding = fit_models(study, range(4), config, variants=True)

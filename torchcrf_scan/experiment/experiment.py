@@ -23,8 +23,8 @@ from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.experiment.ablation import ablation_table
 from torchcrf_scan.experiment.cross_validation import Results, cores, file_name, make_folds, rank_and_world, read_folds, run_folds
 from torchcrf_scan.experiment.methods import ENCODED, EXACT, JOINT, Study
+from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.learning.run_log import RunLog
-from torchcrf_scan.learning.settings import Config
 from torchcrf_scan.scan import Ints, PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_associations, plot_clusters, save_figure
 
@@ -40,7 +40,7 @@ LOSSES = 3  # pictures of the pairs where the joint model loses most against the
 ABLATED = "leave_one_sequence_out"
 
 
-def run_experiment(config: Config) -> dict[str, list[Table]]:
+def run_experiment(config: RunConfig) -> dict[str, list[Table]]:
     """Runs the folds that the output folder lacks, then makes every table and figure.
 
     Returns:
@@ -72,7 +72,7 @@ def run_experiment(config: Config) -> dict[str, list[Table]]:
     return tables
 
 
-def run_ablations(config: Config, variants: Mapping[str, Config]) -> list[Table]:
+def run_ablations(config: RunConfig, variants: Mapping[str, RunConfig]) -> list[Table]:
     """The joint model under every variant of `config`, sequences left out in turn, beside the model of `config` itself.
 
     variants: name -> its config. Returns one table; none on the ranks that only help. Raises ValueError as `run_experiment`.
@@ -89,7 +89,7 @@ def run_ablations(config: Config, variants: Mapping[str, Config]) -> list[Table]
         claim(Path(variant.output), variant, pairs)
         looked_at = json.dumps([variant.learning.seed, variant.learning.disturbance])
 
-        def study(jobs: int, variant: Config = variant, looked_at: str = looked_at) -> Study:
+        def study(jobs: int, variant: RunConfig = variant, looked_at: str = looked_at) -> Study:
             if looked_at not in studies:
                 studies[looked_at] = Study.of(pairs, variant, jobs)
             return studies[looked_at]
@@ -106,7 +106,7 @@ def run_ablations(config: Config, variants: Mapping[str, Config]) -> list[Table]
     return tables
 
 
-def load_pairs(config: Config) -> tuple[list[ScanPair], int]:
+def load_pairs(config: RunConfig) -> tuple[list[ScanPair], int]:
     """The annotated pairs, those that are left out in turn first, and how many these are."""
     experiment, data = config.experiment, config.data
     patterns = (experiment.pairs,) if isinstance(experiment.pairs, str) else experiment.pairs
@@ -117,14 +117,14 @@ def load_pairs(config: Config) -> tuple[list[ScanPair], int]:
     return [*tested, *simulate(experiment.also_train, config, data.seed + ALSO_TRAIN_SEED)], len(tested)
 
 
-def simulate(worlds: Sequence[str], config: Config, seed: int) -> list[ScanPair]:
+def simulate(worlds: Sequence[str], config: RunConfig, seed: int) -> list[ScanPair]:
     """Pairs of every named world, their names told apart by its number."""
     data = config.data
     found = [simulate_pairs(WORLDS[world], data.pairs, data.sequences, seed + k) for k, world in enumerate(worlds)]
     return [replace(pair, name=f"{seed + k}_{pair.name}") for k, of_world in enumerate(found) for pair in of_world]
 
 
-def claim(folder: Path, config: Config, pairs: Sequence[ScanPair]) -> None:
+def claim(folder: Path, config: RunConfig, pairs: Sequence[ScanPair]) -> None:
     """Makes the folder this experiment's; refuses (ValueError) one whose folds were made with other settings or pairs."""
     values = asdict(config)
     for name in ("output", "overfit", "compare_chains"):
@@ -182,13 +182,13 @@ def score(results: Results) -> dict[str, list[PairScore]]:
     }
 
 
-def resample(scores: Sequence[PairScore], config: Config) -> Ints:
+def resample(scores: Sequence[PairScore], config: RunConfig) -> Ints:
     """(R, P) bootstrap weights: over sequences for simulated pairs, over blocks of neighbours in time for recorded ones."""
     draw = by_blocks if config.experiment.pairs else by_sequence
     return draw([one.sequence for one in scores], resamples=config.experiment.resamples)
 
 
-def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: str, config: Config, run: RunLog) -> list[Table]:
+def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: str, config: RunConfig, run: RunLog) -> list[Table]:
     """Overview, Tables I to III, how sure and the differences of one protocol, logged as well."""
     tables = report(scores, seconds=seconds, published=True)
     weights = resample(scores[JOINT], config)

@@ -21,7 +21,9 @@ from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
 from torchcrf_scan.baselines.ransac import match_ransac
 from torchcrf_scan.baselines.start import label_nearest
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.choices import SCHEDULES
 from torchcrf_scan.config import EncoderConfig, ModelConfig
+from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.inference.start import Start, nearest_association
 from torchcrf_scan.learning.calibration_fit import calibrate
@@ -33,7 +35,7 @@ from torchcrf_scan.learning.material import Collection, Material, collect
 from torchcrf_scan.learning.plugins import reach_of_truth
 from torchcrf_scan.learning.ranks import ALONE
 from torchcrf_scan.learning.selection_fit import fit_potential
-from torchcrf_scan.learning.settings import Config, LearningConfig
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.names import LOCAL_CHANNELS
 from torchcrf_scan.scan import Floats, PairPrediction, ScanPair
@@ -66,7 +68,7 @@ class Study:
     icp_shares: Floats
 
     @classmethod
-    def of(cls, pairs: Sequence[ScanPair], config: Config, jobs: int) -> Study:
+    def of(cls, pairs: Sequence[ScanPair], config: RunConfig, jobs: int) -> Study:
         """Looks at the pairs, on `jobs` cores. Raises ValueError for pairs without annotation."""
         collection = collect(pairs, config.learning, jobs)
         if config.experiment.joint_alone:
@@ -92,7 +94,7 @@ class Answer:
     seconds: float
 
 
-def fit_models(study: Study, train: Sequence[int], config: Config, variants: bool) -> Models:
+def fit_models(study: Study, train: Sequence[int], config: RunConfig, variants: bool) -> Models:
     """Refits everything on the pairs `train`: the movers' score, scales, boosters, weights, confidences, and ICP's gate.
 
     Models for ablations are not calibrated: nobody asks how sure they are, and some take minutes a pair.
@@ -122,7 +124,7 @@ def fit_models(study: Study, train: Sequence[int], config: Config, variants: boo
     return Models(models, cascade, choose_gate(study.icp_shares[list(train)], GATES))
 
 
-def fit_encoded(joint: JointScanCRF, pairs: Sequence[ScanPair], material: Sequence[Material], config: Config) -> JointScanCRF:
+def fit_encoded(joint: JointScanCRF, pairs: Sequence[ScanPair], material: Sequence[Material], config: RunConfig) -> JointScanCRF:
     """A model with an encoder, trained first order on the pairs and fresh ones, from `config.init` or a fitted joint model on.
 
     Raises:
@@ -139,7 +141,7 @@ def fit_encoded(joint: JointScanCRF, pairs: Sequence[ScanPair], material: Sequen
     return model
 
 
-def features_key(study: Study, train: Sequence[int], config: Config) -> str:
+def features_key(study: Study, train: Sequence[int], config: RunConfig) -> str:
     """Names everything that scales and boosters depend on: most ablations share them."""
     learning, features, inference = (asdict(part) for part in (config.learning, config.model.features, config.model.inference))
     for name in ("objective", "predicted_share", "prior", "max_steps", "tolerance"):
@@ -150,11 +152,11 @@ def features_key(study: Study, train: Sequence[int], config: Config) -> str:
     return json.dumps([study.collection.names, list(train), learning, features, states])
 
 
-def joint_variants(config: Config) -> list[tuple[str, ModelConfig, LearningConfig]]:
+def joint_variants(config: RunConfig) -> list[tuple[str, ModelConfig, LearningConfig]]:
     """Name, model and learning of the joint model fitted exactly, with both labels in one lattice, and both, where they differ."""
     exactly = replace(config.learning, objective="likelihood", predicted_share=0.5)
     variants = [] if config.learning.objective == "likelihood" else [(EXACT, config.model, exactly)]
-    if config.model.inference.schedule == "sweep":  # the lattice has no other
+    if SCHEDULES[config.model.inference.schedule].takes_couplings:
         lattice = replace(config.model, coupling="lattice")
         learned = {LATTICE: config.learning} if not variants else {LATTICE: config.learning, LATTICE_EXACT: exactly}
         variants += [(name, lattice, learning) for name, learning in learned.items()]

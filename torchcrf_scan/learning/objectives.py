@@ -18,7 +18,8 @@ from torchcrf_scan.learning.settings import Config, LearningConfig
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.search.accept import score_of
 from torchcrf_scan.search.pairs import choose
-from torchcrf_scan.variants.lattice_likelihood import LatticeChain, lattice_chain
+from torchcrf_scan.variants.lattice_likelihood import LatticeChain
+from torchcrf_scan.variants.register import ONE_CHAINS
 
 Objective = Callable[[JointScanCRF, Portion], dict[str, Tensor]]
 
@@ -57,7 +58,6 @@ def labelled_chains(
     The clustering chain beside another is told the model's own associations in `config.predicted_share` of surveyed pairs (A-28).
     """
     batch, fitted, inference = portion.batch, model.fitted, model.config.inference
-    chains = model.config.chains
     learned = fitted.scales, fitted.boosters, inference
     start = start_of(model, portion) if portion.surveys else None
     generator = torch.Generator().manual_seed(portion.seed)
@@ -66,18 +66,19 @@ def labelled_chains(
         plugins = features.true_plugins(view.batch, inference.clusters - 1)
     else:
         plugins = training_plugins(view.batch, start.scaled(view.factor), config, generator)
-    if model.config.coupling == "lattice":
-        yield "lattice", lattice_chain(view, plugins, *learned), torch.cat([fitted.association, fitted.clustering])
+    has_association, has_clusters = model.config.has_association, model.config.has_clusters
+    if one_chain := ONE_CHAINS.get(model.config.coupling):
+        yield model.config.coupling, one_chain(view, plugins, *learned), torch.cat([fitted.association, fitted.clustering])
         return
-    if chains == "matching":
+    if not has_clusters:
         plugins = features.for_background_alone(plugins)
-    if chains != "clustering":
+    if has_association:
         yield "association", features.association_chain(view, plugins, *learned), fitted.association
-    if chains == "joint" and start is not None:
+    if has_association and has_clusters and start is not None:
         with torch.no_grad():
             predicted = model(batch.without_truth(), start).association
         plugins = mix_associations(plugins, predicted, config.predicted_share, generator)
-    if chains != "matching":
+    if has_clusters:
         yield "cluster", features.clustering_chain(view, plugins, fitted.scales), fitted.clustering
 
 
@@ -85,8 +86,7 @@ def start_of(model: JointScanCRF, portion: Portion) -> Start:
     """The motions to begin with, from what was surveyed, or looked for now."""
     if not portion.surveys:
         return model.initialise(portion.batch)
-    clusters = 1 if model.config.chains == "matching" else model.config.inference.clusters - 1
-    return choose(portion.batch, portion.surveys, score_of(model.hypothesis_score), clusters)
+    return choose(portion.batch, portion.surveys, score_of(model.hypothesis_score), model.config.motions)
 
 
 def make_objective(config: Config) -> Objective:

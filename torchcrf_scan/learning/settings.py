@@ -1,4 +1,4 @@
-"""."""
+"""Settings of learning: from which pairs, by which losses, how fast."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from torchcrf_scan.checks import choose, within
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.data.worlds import WORLDS
-from torchcrf_scan.experiment.settings import ExperimentConfig
 
 
 @dataclass(frozen=True)
@@ -228,10 +227,9 @@ class DataConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """One run of `train.py` or of `torchcrf-scan experiment`.
+    """One training run.
 
     Attributes:
-        experiment: what `torchcrf-scan experiment` does; `train.py` does not look at it.
         output: run folder; resolved config, versions, model, metrics, events and pictures go there.
         overfit: train and test on the first training pair alone, a quick check that everything can learn.
         compare_chains: also fit and evaluate CRF-Matching and CRF-Clustering alone.
@@ -244,7 +242,6 @@ class Config:
     learning: LearningConfig = field(default_factory=LearningConfig)
     gradient: GradientConfig = field(default_factory=GradientConfig)
     unrolled: UnrolledConfig = field(default_factory=UnrolledConfig)
-    experiment: ExperimentConfig = field(default_factory=ExperimentConfig)
     output: str = "runs/default"
     overfit: bool = False
     compare_chains: bool = True

@@ -42,6 +42,7 @@ from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.variants.register import ONE_CHAINS
 
 log = logging.getLogger(__name__)
 
@@ -91,7 +92,7 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
                 train_by_gradient(model, config, train_pairs, held_out, store, ranks, monitor, state=state)
         cascade = None
         if run is not None:
-            if config.first_order != "none" and model.config.chains == "joint":
+            if config.first_order != "none" and model.config.has_association and model.config.has_clusters:
                 model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
             calibrate(model, material)
             cascade = fit_baselines(material, config, run)
@@ -194,7 +195,7 @@ def refuse_leaks(train_pairs: Sequence[ScanPair], test_pairs: Sequence[ScanPair]
 
 def fit_baselines(material: list[Material], config: Config, run: RunLog) -> Cascade | None:
     """Fits each chain alone where asked for, from the same start."""
-    if not config.compare_chains or config.model.chains != "joint":
+    if not (config.compare_chains and config.model.has_association and config.model.has_clusters):
         return None
     learning = replace(config, learning=config.staged)
     return fit_cascade(material, learning, {method: watches(run, method) for method in ("matching", "clustering")})
@@ -219,7 +220,7 @@ def watches(run: RunLog, method: str) -> dict[str, Watch]:
 
         return look
 
-    return {chain: watch(chain) for chain in ("association", "clustering", "lattice")}
+    return {chain: watch(chain) for chain in ("association", "clustering", *ONE_CHAINS)}
 
 
 @torch.no_grad()

@@ -94,10 +94,10 @@ class Flooding:
         self.sums = self._running_sums()
         found = find_candidates(self.view, self.state.motions.value, self.state.motions.active, self.config)
         order = range(batch.source.shape[1] - 1, -1, -1) if descending else range(batch.source.shape[1])
-        if self.model.chains != "matching":
+        if self.model.has_clusters:
             for i in order:
                 self.visit_cluster(i, found)
-        if self.model.chains != "clustering":
+        if self.model.has_association:
             self._take_candidates(found)
             for i in order:
                 self.visit_association(i)
@@ -156,7 +156,7 @@ class Flooding:
         association = state.association.clone()
         association[:, here] = joint.association_labels(belief[:, None].argmax(-1), states.candidates, batch.source_mask[:, here])
         state = replace(state, log_association=log_association, association=association)
-        if self.model.chains == "matching":
+        if not self.model.has_clusters:
             state = joint.inliers_are_background(state)
         self._relabel(i, state)
 
