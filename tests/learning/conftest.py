@@ -5,8 +5,9 @@ import pytest
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.experiment.methods import Models, Study, fit_models
+from torchcrf_scan.experiment.models import Models, fit_models
 from torchcrf_scan.experiment.settings import ExperimentConfig, RunConfig
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.scan import ScanPair
 

@@ -12,7 +12,8 @@ from made_up import RIVAL, Recorder, guess, make_pairs, make_study
 
 from torchcrf_scan.experiment import cross_validation
 from torchcrf_scan.experiment.cross_validation import SECONDS, Fold, cores, file_name, make_folds, read_folds, run_folds, write_fold
-from torchcrf_scan.experiment.methods import JOINT, METHODS, Answer
+from torchcrf_scan.experiment.methods import METHODS, Answer
+from torchcrf_scan.experiment.models import JOINT
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.scan import ScanPair
 

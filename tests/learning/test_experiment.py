@@ -26,8 +26,9 @@ from torchcrf_scan.experiment.experiment import (
     worst_pairs,
     write_tables,
 )
-from torchcrf_scan.experiment.methods import JOINT, Study
+from torchcrf_scan.experiment.models import JOINT
 from torchcrf_scan.experiment.settings import ExperimentConfig, RunConfig
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning.settings import LearningConfig
 
 SMALL = ExperimentConfig(jobs=1, resamples=20)

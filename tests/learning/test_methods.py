@@ -9,24 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
+from torchcrf_scan.baselines.register import BASELINES, Baseline, installed
 from torchcrf_scan.config import EncoderConfig
-from torchcrf_scan.experiment.methods import (
-    ENCODED,
-    EXACT,
-    JOINT,
-    LATTICE,
-    LATTICE_EXACT,
-    METHODS,
-    Answer,
-    Models,
-    Study,
-    answer,
-    fit_models,
-    with_config,
-    with_motions_given,
-)
+from torchcrf_scan.experiment.methods import METHODS, Answer, answer, with_config, with_motions_given
+from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT, LATTICE, LATTICE_EXACT, Models, fit_models
 from torchcrf_scan.experiment.settings import RunConfig
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.settings import GradientConfig
@@ -45,17 +33,19 @@ def answers(models: Models, small_pairs: list[ScanPair]) -> dict[str, Answer]:
 
 def test_every_row_that_can_be_there_is_there(answers: dict[str, Answer]) -> None:
     assert len(set(METHODS)) == len(METHODS)
-    assert set(answers) == set(METHODS) - {ENCODED} - (set(LIBRARIES) - set(installed_libraries()))
+    assert set(answers) == set(METHODS) - {ENCODED} - (set(BASELINES) - set(installed()))
 
 
 def test_a_library_has_its_row_where_it_is_installed(
     answers: dict[str, Answer], models: Models, small_pairs: list[ScanPair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     still = answers["all background"].prediction
-    monkeypatch.setattr("torchcrf_scan.experiment.methods.installed_libraries", lambda: dict.fromkeys(LIBRARIES, lambda _: still))
+    libraries = {row: Baseline(lambda case: still) for row, baseline in BASELINES.items() if baseline.requires}
+    monkeypatch.setattr("torchcrf_scan.experiment.methods.installed", lambda: {**BASELINES, **libraries})
     found = answer(models, small_pairs[5])
-    assert set(found) == set(METHODS) - {ENCODED}
-    assert all(found[name].prediction is still for name in LIBRARIES)
+    assert list(found) == [row for row in METHODS if row != ENCODED]
+    assert len(libraries) == 2
+    assert all(found[row].prediction is still for row in libraries)
 
 
 def test_answers_are_of_the_pair_and_took_time(answers: dict[str, Answer], small_pairs: list[ScanPair]) -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from importlib import import_module
-
 import numpy as np
 
 from torchcrf_scan.baselines.labels import all_outliers
@@ -37,25 +34,6 @@ def match_open3d(pair: ScanPair) -> PairPrediction:
     )
     found = open3d.pipelines.registration.registration_icp(source, target, REACH)
     return match_under(pair, planar_motion(found.transformation))
-
-
-LIBRARIES: dict[str, tuple[str, Callable[[ScanPair], PairPrediction]]] = {
-    "small_gicp (ICP)": ("small_gicp", match_small_gicp),
-    "Open3D (ICP)": ("open3d", match_open3d),
-}
-
-
-def installed_libraries() -> dict[str, Callable[[ScanPair], PairPrediction]]:
-    """Row name -> method, of the libraries that can be imported here; one that is installed may still lack what it needs."""
-    return {row: match for row, (module, match) in LIBRARIES.items() if _can_import(module)}
-
-
-def _can_import(module: str) -> bool:
-    try:
-        import_module(module)
-    except ImportError:
-        return False
-    return True
 
 
 def planar_motion(transform: Floats) -> Floats:

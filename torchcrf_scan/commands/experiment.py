@@ -25,7 +25,7 @@ def experiment(*, ablations: str | None = None, **settings: Any) -> int:
     from torchcrf_scan.experiment.experiment import run_ablations, run_experiment
 
     config = RunConfig(**{name: value for name, value in settings.items() if name != "config"})
-    if config.first_order != "none" and config.model.encoder.width == 0:
+    if config.has_steps and config.model.encoder.width == 0:
         got = config.first_order
         raise ValueError(f"gradient.objective: expected none in an experiment without model.encoder (it fits in stages), got {got}")
     logging.basicConfig(level=logging.INFO, format="%(message)s")

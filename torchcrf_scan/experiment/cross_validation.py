@@ -24,8 +24,10 @@ from joblib import Parallel, cpu_count, delayed
 from tqdm import tqdm
 
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
-from torchcrf_scan.experiment.methods import METHODS, Answer, Study, answer, fit_models
+from torchcrf_scan.experiment.methods import METHODS, Answer, answer
+from torchcrf_scan.experiment.models import fit_models
 from torchcrf_scan.experiment.settings import RunConfig
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 SECONDS = "seconds.json"

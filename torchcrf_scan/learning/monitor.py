@@ -22,6 +22,7 @@ from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.inference import pseudo_likelihood
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.graph import write_graph
+from torchcrf_scan.learning.losses import LOSSES
 from torchcrf_scan.learning.run_log import write_settings
 from torchcrf_scan.learning.settings import Config
 from torchcrf_scan.model import JointScanCRF
@@ -111,8 +112,9 @@ class TrainingMonitor:
     @property
     def temperature(self) -> float:
         """Of the read-out that the loss looks at."""
-        is_unrolled = self.config.first_order == "unrolled"
-        return self.config.unrolled.temperature if is_unrolled else self.config.model.inference.temperature
+        config = self.config
+        is_own = config.has_steps and LOSSES[config.first_order].has_temperature
+        return config.unrolled.temperature if is_own else config.model.inference.temperature
 
     @while_it_can_write
     def validated(self, step: int, model: JointScanCRF, losses: Mapping[str, float], answers: Answers) -> None:

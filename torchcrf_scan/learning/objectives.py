@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.choices import load
 from torchcrf_scan.inference import pseudo_likelihood as features
 from torchcrf_scan.inference.start import Start
+from torchcrf_scan.learning.losses import LOSSES
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.portions import Portion
 from torchcrf_scan.learning.settings import Config, LearningConfig
@@ -91,13 +93,15 @@ def start_of(model: JointScanCRF, portion: Portion) -> Start:
 
 def make_objective(config: Config) -> Objective:
     """The loss that `config.first_order` names."""
-    if config.first_order == "pseudo_likelihood":
-        return pseudo_likelihood
-    if config.first_order == "likelihood":
-        return partial(likelihood, config=config.learning)
-    from torchcrf_scan.learning.unrolled import unrolled_loss
+    objective: Objective = load(LOSSES[config.first_order].function)(config)
+    return objective
 
-    def unrolled(model: JointScanCRF, portion: Portion) -> dict[str, Tensor]:
-        return unrolled_loss(model, portion.batch, config.unrolled, start_of(model, portion))
 
-    return unrolled
+def make_pseudo_likelihood(config: Config) -> Objective:
+    """`pseudo_likelihood`, which has no settings."""
+    return pseudo_likelihood
+
+
+def make_likelihood(config: Config) -> Objective:
+    """`likelihood` with plug-ins as `config.learning` says."""
+    return partial(likelihood, config=config.learning)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from torchcrf_scan.checks import choose, within
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.learning.losses import LOSSES, NO_STEPS, STAGED
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class LearningConfig:
         seed: of everything drawn while learning.
     """
 
-    objective: str = "pseudo_likelihood"
+    objective: str = STAGED
     rotation_noise: float = 0.005
     translation_noise: float = 0.02
     disturbance: float = 0.7
@@ -92,7 +93,7 @@ class LearningConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        choose("objective", self.objective, ("pseudo_likelihood", "likelihood", "unrolled"))
+        choose("objective", self.objective, tuple(LOSSES))
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ class GradientConfig:
         seed: of everything drawn: pair k of a run is a function of (seed, k) alone.
     """
 
-    objective: str = "none"
+    objective: str = NO_STEPS
     steps: int = 200
     batch_size: int = 8
     part: int = 4
@@ -176,7 +177,7 @@ class GradientConfig:
     augment: AugmentConfig = field(default_factory=AugmentConfig)
 
     def __post_init__(self) -> None:
-        choose("gradient.objective", self.objective, ("none", "pseudo_likelihood", "likelihood", "unrolled"))
+        choose("gradient.objective", self.objective, (NO_STEPS, *LOSSES))
         choose("gradient.device", self.device, ("auto", "cpu", "cuda"))
         for world in self.worlds:
             choose("gradient.worlds", world, tuple(WORLDS))
@@ -248,18 +249,23 @@ class Config:
     init: str = ""
 
     def __post_init__(self) -> None:
-        other = self.gradient.objective
-        if self.learning.objective == "unrolled" and other not in ("none", "unrolled"):
-            raise ValueError(f"gradient.objective: expected unrolled with learning.objective unrolled, got {other}")
-        if self.init and self.first_order == "none":
+        other, staged = self.gradient.objective, self.learning.objective
+        if not LOSSES[staged].is_staged and other not in (NO_STEPS, staged):
+            raise ValueError(f"gradient.objective: expected {staged} with learning.objective {staged}, got {other}")
+        if self.init and not self.has_steps:
             raise ValueError(f"init: expected a gradient.objective to go on with from {self.init}, got none")
 
     @property
     def first_order(self) -> str:
         """The loss of first-order training: `none`, or one of `GradientConfig.objective`."""
-        return "unrolled" if self.learning.objective == "unrolled" else self.gradient.objective
+        return self.gradient.objective if LOSSES[self.learning.objective].is_staged else self.learning.objective
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether there is first-order training."""
+        return self.first_order != NO_STEPS
 
     @property
     def staged(self) -> LearningConfig:
-        """How the staged fit learns: what goes on through the unrolled iterations begins with pseudo-likelihood."""
-        return replace(self.learning, objective="pseudo_likelihood") if self.learning.objective == "unrolled" else self.learning
+        """How the staged fit learns: a loss that it does not know goes on from the fit of `STAGED`."""
+        return self.learning if LOSSES[self.learning.objective].is_staged else replace(self.learning, objective=STAGED)

@@ -25,7 +25,9 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import joint
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import State
-from torchcrf_scan.learning.settings import UnrolledConfig
+from torchcrf_scan.learning.objectives import Objective, start_of
+from torchcrf_scan.learning.portions import Portion
+from torchcrf_scan.learning.settings import Config, UnrolledConfig
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.variants import sweep
 
@@ -60,6 +62,15 @@ class Sum:
     def over(cls, losses: Tensor, known: Tensor) -> Sum:
         """losses, known: (...)."""
         return cls(torch.where(known, losses, torch.zeros_like(losses)).sum(), known.sum().to(losses))
+
+
+def make_unrolled(config: Config) -> Objective:
+    """The objective: `unrolled_loss` at the starts of the portion."""
+
+    def unrolled(model: JointScanCRF, portion: Portion) -> dict[str, Tensor]:
+        return unrolled_loss(model, portion.batch, config.unrolled, start_of(model, portion))
+
+    return unrolled
 
 
 def unrolled_loss(
