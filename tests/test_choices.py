@@ -10,7 +10,7 @@ from torchcrf_scan import ExtraLogUnary, FeatureConfig, InferenceConfig, JointSc
 from torchcrf_scan.choices import MOTION_METRICS, OF_INFERENCE, OF_MODEL, OF_ROUNDS, STARTS, Variant, load, with_ability
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.export import OUTPUTS, decoder_inputs, export_program, unrolled_config
+from torchcrf_scan.export import OUTPUTS, UnrolledDecoder, decoder_inputs, unrolled_config
 from torchcrf_scan.fast.choice import can_decode
 from torchcrf_scan.fast.motion import METRICS
 from torchcrf_scan.inference.motion import FITS
@@ -131,11 +131,15 @@ def test_rounds_are_exported_where_declared(setting: str, name: str) -> None:
             unrolled_config(config)
         return
     batch = scene(4)
-    model, start = JointScanCRF(config), start_of(batch, config)
-    program = export_program(model, batch, start).module()
-    found, expected = program(**decoder_inputs(batch, start)), model(batch, start)
+    start = start_of(batch, config)
+    decoder = UnrolledDecoder(JointScanCRF(config), plain=True)
+    inputs = decoder_inputs(batch, start)
+    with torch.no_grad():
+        found, expected = decoder(**inputs), decoder.model(batch, start)
+        shapes = decoder.to("meta")(**{key: value.to("meta") for key, value in inputs.items()})  # no step may ask for a value
     for output in OUTPUTS:
         assert torch.allclose(found[output], getattr(expected, output), atol=1e-5), output
+        assert shapes[output].shape == found[output].shape, output
 
 
 @pytest.mark.parametrize("name", STARTS)

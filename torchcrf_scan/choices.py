@@ -32,7 +32,7 @@ class Variant:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Schedule(Variant):
-    """In which order messages pass: `function(view, start, parameters, model)` decodes. takes_couplings: of all kinds."""
+    """In which order messages pass: `function(view, start, parameters, model)` decodes. takes_couplings: it has rounds, of any coupling."""
 
     takes_couplings: bool = True
 
@@ -110,7 +110,7 @@ MOVERS: Mapping[str, Variant] = {"joint": Variant(), "threshold": Variant()}
 CANDIDATE_SEARCHES: Mapping[str, Variant] = {
     "motion": Variant(),
     "position": Variant(in_loops=False),
-    "shape": Variant(in_loops=False),
+    "shape": Variant(is_exportable=False, in_loops=False),  # how many points are compared at once depends on the pairs
 }
 
 OF_INFERENCE: Mapping[str, Mapping[str, Variant]] = {  # by setting of `InferenceConfig`

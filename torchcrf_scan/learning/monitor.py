@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.choices import SCHEDULES
 from torchcrf_scan.evaluation.calibration import Sureness
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.evaluation.summary import summarise
@@ -209,7 +210,7 @@ def belief_changes(model: JointScanCRF, batch: ScanPairBatch, start: Start) -> d
 
     Messages on a chain are exact, so what is left to settle is between the rounds.
     """
-    if model.config.without("is_exportable"):
+    if not SCHEDULES[model.config.inference.schedule].takes_couplings:
         return {}
     view = model.view(batch, model.learned_inputs(batch, start))
     found = sweep.rounds(view, start.scaled(view.factor), model.fitted, model.config)
