@@ -32,7 +32,11 @@ class Variant:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Schedule(Variant):
-    """In which order messages pass: `function(view, start, parameters, model)` decodes. takes_couplings: it has rounds, of any coupling."""
+    """In which order messages pass: `function(view, start, parameters, model)` decodes.
+
+    Attributes:
+        takes_couplings: it goes in rounds, of any coupling.
+    """
 
     takes_couplings: bool = True
 
