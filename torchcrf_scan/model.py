@@ -37,6 +37,8 @@ from torchcrf_scan.search.pairs import initialise, start_pairs
 from torchcrf_scan.search.score import HypothesisScore
 from torchcrf_scan.variants.register import BEGINNINGS, DECODERS, LIKELIHOODS
 
+BothEmbeddings = tuple[Tensor | None, Tensor | None]  # of source and target
+
 
 class JointScanCRF(nn.Module):
     """Data association, clustering and motions of B scan pairs by a log-linear conditional random field.
@@ -122,30 +124,30 @@ class JointScanCRF(nn.Module):
         target_embedding: Tensor | None = None,
         extra_log_unary: ExtraLogUnary | None = None,
     ) -> LearnedInputs | None:
-        """The optional inputs of `forward`, checked, with what the encoder says of the batch; None where there are none.
+        """The optional inputs of `forward`, checked, with the output of the encoder; None where there are none.
 
-        start: motions that the encoder is to see the batch under; None: it is not asked.
+        start: motions under which the encoder sees the batch; None: without the encoder.
         """
-        extra = extra_log_unary or ExtraLogUnary()
+        extra, embeddings = extra_log_unary or ExtraLogUnary(), (source_embedding, target_embedding)
         if self.encoder is not None and start is not None:
-            encoded = self.encoder(batch, start, self.config.inference.backend)
-            extra = extra.plus(encoded.extra)
-            if encoded.source_embedding is not None:
-                if source_embedding is not None or target_embedding is not None:
-                    raise ValueError("source_embedding: expected none for a model whose encoder makes embeddings, got one")
-                source_embedding, target_embedding = encoded.source_embedding, encoded.target_embedding
-        given = {"source_embedding": source_embedding, "target_embedding": target_embedding}
-        given |= {"extra_log_unary.outlier": extra.outlier, "extra_log_unary.moving": extra.moving}
-        if all(value is None for value in given.values()):
+            extra, embeddings = self._with_encoder(self.encoder, batch, start, extra, embeddings)
+        if all(value is None for value in (*embeddings, extra.outlier, extra.moving)):
             return None
         self.config.require("takes_extras", "with embeddings or extra_log_unary")
-        for name, value in given.items():
-            points = batch.target_mask if name == "target_embedding" else batch.source_mask
-            wanted = (*points.shape, "C") if name.endswith("embedding") else tuple(points.shape)
-            if value is not None and (value.dim() != len(wanted) or value.shape[:2] != points.shape):
-                raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
+        check_inputs(batch, extra, embeddings)
         outlier, moving = (None if of is None else torch.where(batch.source_mask, of, 0.0) for of in (extra.outlier, extra.moving))
-        return LearnedInputs(self._embeddings(batch, source_embedding, target_embedding), outlier, moving)
+        return LearnedInputs(self._embeddings(batch, *embeddings), outlier, moving)
+
+    def _with_encoder(
+        self, encoder: ScanEncoder, batch: ScanPairBatch, start: Start, extra: ExtraLogUnary, embeddings: BothEmbeddings
+    ) -> tuple[ExtraLogUnary, BothEmbeddings]:
+        """The inputs with the output of the encoder."""
+        encoded = encoder(batch, start, self.config.inference.backend)
+        if encoded.source_embedding is None:
+            return extra.plus(encoded.extra), embeddings
+        if any(of is not None for of in embeddings):
+            raise ValueError("source_embedding: expected none for a model whose encoder makes embeddings, got one")
+        return extra.plus(encoded.extra), (encoded.source_embedding, encoded.target_embedding)
 
     def _embeddings(self, batch: ScanPairBatch, source: Tensor | None, target: Tensor | None) -> Embeddings | None:
         if source is None and target is None:
@@ -305,6 +307,17 @@ class JointScanCRF(nn.Module):
     def embedding_state(self) -> dict[str, Tensor]:
         """The part of the model's state that another without embeddings has not."""
         return {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in EMBEDDING_WEIGHTS}
+
+
+def check_inputs(batch: ScanPairBatch, extra: ExtraLogUnary, embeddings: BothEmbeddings) -> None:
+    """Raises ValueError where an optional input of `forward` has another shape than the batch."""
+    given = {"source_embedding": embeddings[0], "target_embedding": embeddings[1]}
+    given |= {"extra_log_unary.outlier": extra.outlier, "extra_log_unary.moving": extra.moving}
+    for name, value in given.items():
+        points = batch.target_mask if name == "target_embedding" else batch.source_mask
+        wanted = (*points.shape, "C") if name.endswith("embedding") else tuple(points.shape)
+        if value is not None and (value.dim() != len(wanted) or value.shape[:2] != points.shape):
+            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
 
 
 class MatchingCRF(JointScanCRF):
