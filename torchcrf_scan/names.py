@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-SHAPE = ("dist1", "dist3", "dist5", "angle1", "angle3", "angle5", "geo1", "geo3", "geo5")  # L1..L9, the same however scans move
+DISTANCES, ANGLES, GEODESICS = ("dist1", "dist3", "dist5"), ("angle1", "angle3", "angle5"), ("geo1", "geo3", "geo5")
+SHAPE = (*DISTANCES, *ANGLES, *GEODESICS)  # L1..L9, the same however scans move
 STATIC = (*SHAPE, "radius", "translation")  # L1..L11, whatever the motions
 LOCAL_CHANNELS = (*STATIC, "registered_translation")  # L1..L12
 SHAPE_CHANNELS, STATIC_CHANNELS = len(SHAPE), len(STATIC)
@@ -14,7 +15,8 @@ ASSOCIATION_FREE_SPACE = ("outlier_seen_through", "outlier_hidden")
 CLUSTERING_FREE_SPACE = ("seen_through", "seen_through_back", "hidden", "hidden_back", "outlier_seen_through", "outlier_hidden")
 
 ASSOCIATION_NODE = (*LOCAL_CHANNELS, *BOOSTING, *ASSOCIATION_DECISIONS, *ASSOCIATION_FREE_SPACE)
-ASSOCIATION_EDGE = ("sequence", "pairwise_outlier", "pairwise_distance", "pairwise_translation")
+SCALED_EDGES = ("pairwise_distance", "pairwise_translation")  # those with a scale
+ASSOCIATION_EDGE = ("sequence", "pairwise_outlier", *SCALED_EDGES)
 ASSOCIATION_WEIGHTS = (*ASSOCIATION_NODE, *ASSOCIATION_EDGE)  # a01..a14, the extensions, a15..a18
 
 PAPERS_CLUSTER = ("cluster_distance", "outlier", "cluster_inlier_in", "cluster_inlier_out")

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchcrf_scan.features.scales import Scales, robust_square
 from torchcrf_scan.features.shape import ShapeDescriptors, gather_points
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.names import LOCAL_CHANNELS, STATIC_CHANNELS
+from torchcrf_scan.names import ANGLES, DISTANCES, GEODESICS, LOCAL_CHANNELS, SHAPE_CHANNELS, STATIC_CHANNELS
 
 
 def _of_candidates(values: Tensor, candidates: Tensor) -> Tensor:
@@ -38,11 +38,12 @@ def shape_features(source: ShapeDescriptors, target: ShapeDescriptors, candidate
         return robust_square(error, scale[:, None]).mean(-1)
 
     angle = se2.wrap(source.angle[:, :, None] - _of_candidates(target.angle, candidates))
+    distance, turn, geodesic = scales.local[:SHAPE_CHANNELS].split([len(DISTANCES), len(ANGLES), len(GEODESICS)])
     return torch.cat(
         [
-            lengths(source.distance, target.distance, scales.local[0:3]),
-            robust_square(angle, scales.local[3:6]),
-            lengths(source.geodesic, target.geodesic, scales.local[6:9]),
+            lengths(source.distance, target.distance, distance),
+            robust_square(angle, turn),
+            lengths(source.geodesic, target.geodesic, geodesic),
         ],
         dim=-1,
     )

@@ -12,10 +12,20 @@ from torchcrf_scan.names import (
     DECISION_WEIGHTS,
     FREE_SPACE_WEIGHTS,
     LOCAL_CHANNELS,
+    SCALED_EDGES,
 )
 
 GATE_WIDTH = 0.05
 KAPPA = 9.0  # an error of three standard deviations is as bad as any (spec 0.1)
+
+
+# Scales before any fitting, metres or radians.
+LOCAL = {
+    **{"dist1": 0.1, "dist3": 0.2, "dist5": 0.3, "angle1": 0.3, "angle3": 0.3, "angle5": 0.3},
+    **{"geo1": 0.1, "geo3": 0.3, "geo5": 0.5, "radius": 0.5, "translation": 0.5, "registered_translation": 0.1},
+}
+EDGES = {"pairwise_distance": 0.1, "pairwise_translation": 0.15}
+WORST = -4.0  # what a channel gives the outlier
 
 
 def live_weights(config: FeatureConfig) -> tuple[Tensor, Tensor]:
@@ -71,12 +81,11 @@ class Scales(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        local = [0.1, 0.2, 0.3, 0.3, 0.3, 0.3, 0.1, 0.3, 0.5, 0.5, 0.5, 0.1]
         values = {
-            "local": local,
-            "local_outlier": [-4.0] * len(LOCAL_CHANNELS),
-            "pairwise": [0.1, 0.15],
-            "pairwise_outlier": [-4.0, -4.0],
+            "local": [LOCAL[name] for name in LOCAL_CHANNELS],
+            "local_outlier": [WORST] * len(LOCAL_CHANNELS),
+            "pairwise": [EDGES[name] for name in SCALED_EDGES],
+            "pairwise_outlier": [WORST] * len(SCALED_EDGES),
             "cluster_distance": 0.1,
             "outlier_threshold": 0.3,
             "gate": 0.3,
