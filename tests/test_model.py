@@ -262,7 +262,7 @@ def test_saving_twice_keeps_the_last(tmp_path: Path) -> None:
 def test_an_unknown_name_lists_the_shipped_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("one", "other"):
         JointScanCRF().save_pretrained(tmp_path / "weights" / name)
-    monkeypatch.setattr("torchcrf_scan.model.files", lambda package: tmp_path)
+    monkeypatch.setattr("torchcrf_scan.pretrained.files", lambda package: tmp_path)
     with pytest.raises(ValueError, match=r"expected a folder with config\.json or one of one, other shipped models, got nowhere"):
         JointScanCRF.from_pretrained("nowhere")
     assert len(JointScanCRF.from_pretrained("other").state_dict()) > 30
