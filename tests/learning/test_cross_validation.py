@@ -186,7 +186,7 @@ SCRIPT = """
 import os, sys
 from pathlib import Path
 from made_up import Recorder, make_pairs, make_study
-from torchcrf_scan.config import RunConfig
+from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.cross_validation import make_folds, run_folds
 rank, pairs, recorder = os.environ["RANK"], make_pairs(*"aabc"), Recorder()
 recorder.install()
