@@ -4,6 +4,7 @@ import copy
 import itertools
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -179,3 +180,17 @@ def test_another_config_shares_the_weights(models: Models) -> None:
         assert mine is theirs, name
     assert other.scales is model.scales
     assert other.boosters is model.boosters
+
+
+def test_variants_that_share_their_features_fit_them_once(
+    study: Study, models: Models, small_config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = replace(study, kept=tmp_path)
+    config = replace(small_config, experiment=replace(small_config.experiment, joint_alone=True))
+    first = fit_models(kept, range(4), config, variants=False).joint[JOINT]
+    assert len(list(tmp_path.iterdir())) == 1
+    monkeypatch.setattr("torchcrf_scan.learning.fit.fit_all_boosters", lambda *_: pytest.fail("fitted again"))
+    faster = replace(config, model=replace(config.model, inference=replace(config.model.inference, iterations=1)))
+    again = fit_models(kept, range(4), faster, variants=False).joint[JOINT]
+    assert torch.equal(again.boosters.data.table, first.boosters.data.table)
+    assert torch.equal(first.boosters.data.table, models.joint[JOINT].boosters.data.table)
