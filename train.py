@@ -22,7 +22,7 @@ from pathlib import Path
 from jsonargparse import ArgumentParser
 
 from torchcrf_scan.evaluation.report import report
-from torchcrf_scan.learning.settings import Config
+from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.learning.trainer import train
 
 
@@ -31,11 +31,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = ArgumentParser(description=__doc__)
     parser.add_argument("--config", action="config", help="YAML file of settings")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the run folder")
-    parser.add_class_arguments(Config)
+    parser.add_class_arguments(RunConfig)
     settings = parser.parse_args(argv)
     resume = settings.pop("resume")
     try:
-        config = Config(**{k: v for k, v in parser.instantiate(settings).items() if k not in ("config", "resume")})
+        config = RunConfig(**{k: v for k, v in parser.instantiate(settings).items() if k not in ("config", "resume")})
     except ValueError as error:
         parser.error(str(error))
 

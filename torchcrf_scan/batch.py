@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,9 +12,6 @@ from torch import Tensor
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats, Scan, ScanPair
 from torchcrf_scan.tree import tensor_tree
-
-if TYPE_CHECKING:
-    pass
 
 
 @tensor_tree

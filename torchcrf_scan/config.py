@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass, field
 
 from torchcrf_scan.checks import choose, within
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
+from torchcrf_scan.choices import CHAINS, COUPLINGS, OF_INFERENCE, OF_MODEL, OF_ROUNDS, SCHEDULES, with_ability
+from torchcrf_scan.names import WEIGHTS
 
 LEFT_OUT = (
     *("association.pairwise_distance", "association.pairwise_translation"),
     *("clustering.gate", "clustering.outlier_bias"),
 )  # by default
-WEIGHTS = (*(f"association.{name}" for name in ASSOCIATION_WEIGHTS), *(f"clustering.{name}" for name in CLUSTERING_WEIGHTS))
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,10 @@ class InferenceConfig:
     translation_tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
-        choose("candidate_search", self.candidate_search, ("motion", "position", "shape"))
-        choose("schedule", self.schedule, ("sweep", "flooding"))
+        for name, register in OF_INFERENCE.items():
+            choose(name, getattr(self, name), tuple(register))
         choose("flooding_order", self.flooding_order, ("alternate", "ascending"))
-        choose("motion_weights", self.motion_weights, ("hard", "soft"))
-        choose("movers", self.movers, ("joint", "threshold"))
         choose("backend", self.backend, ("auto", "compiled", "eager"))
-        choose("motion_metric", self.motion_metric, ("point", "line", "given"))
         if self.clusters < 2:
             raise ValueError(f"clusters: expected at least 2 (background and outlier), got {self.clusters}")
         for name in ("candidates", "iterations", "temperature"):
@@ -161,14 +158,40 @@ class ModelConfig:
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
 
     def __post_init__(self) -> None:
-        if self.encoder.width > 0 and self.inference.schedule == "flooding":
-            raise ValueError("schedule: expected sweep for a model with an encoder, got flooding")
+        for name, register in OF_MODEL.items():
+            choose(name, getattr(self, name), tuple(register))
+        if self.encoder.width > 0:
+            self.require("takes_extras", "for a model with an encoder")
         if self.encoder.embedding > 0 and self.features.embedding == "none":
             raise ValueError("features.embedding: expected dot or cosine for an encoder that makes embeddings, got none")
-        choose("chains", self.chains, ("joint", "matching", "clustering"))
-        choose("coupling", self.coupling, ("motions", "lattice"))
-        choose("start", self.start, ("search", "paper", "points"))
-        if self.coupling == "lattice" and self.chains != "joint":
-            raise ValueError(f"coupling: expected motions for the {self.chains} chain alone, got lattice")
-        if self.coupling == "lattice" and self.inference.schedule != "sweep":
-            raise ValueError(f"coupling: expected motions with schedule {self.inference.schedule}, got lattice")
+        schedule, is_one_chain = self.inference.schedule, bool(COUPLINGS[self.coupling].chain)
+        two_chains = " or ".join(name for name, coupling in COUPLINGS.items() if not coupling.chain)
+        if is_one_chain and not (self.has_association and self.has_clusters):
+            raise ValueError(f"coupling: expected {two_chains} for the {self.chains} chain alone, got {self.coupling}")
+        if is_one_chain and not SCHEDULES[schedule].takes_couplings:
+            raise ValueError(f"coupling: expected {two_chains} with schedule {schedule}, got {self.coupling}")
+
+    @property
+    def has_association(self) -> bool:
+        """Whether the model has the association chain."""
+        return CHAINS[self.chains].has_association
+
+    @property
+    def has_clusters(self) -> bool:
+        """Whether the model has the clustering chain."""
+        return CHAINS[self.chains].has_clusters
+
+    @property
+    def motions(self) -> int:
+        """C: motions of the background and of as many movers as there may be."""
+        return self.inference.clusters - 1 if self.has_clusters else 1
+
+    def without(self, ability: str) -> dict[str, str]:
+        """The settings of the rounds, with their values, whose variant lacks an ability (`choices.Variant`)."""
+        chosen = {name: getattr(self.inference if name in OF_INFERENCE else self, name) for name in OF_ROUNDS}
+        return {name: value for name, value in chosen.items() if not getattr(OF_ROUNDS[name][value], ability)}
+
+    def require(self, ability: str, purpose: str) -> None:
+        """Raises ValueError where a variant lacks an ability that a purpose needs."""
+        for name, value in self.without(ability).items():
+            raise ValueError(f"{name}: expected {' or '.join(with_ability(OF_ROUNDS[name], ability))} {purpose}, got {value}")

@@ -24,8 +24,10 @@ from joblib import Parallel, cpu_count, delayed
 from tqdm import tqdm
 
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
-from torchcrf_scan.experiment.methods import METHODS, Answer, Study, answer, fit_models
-from torchcrf_scan.learning.settings import Config
+from torchcrf_scan.experiment.methods import METHODS, Answer, answer
+from torchcrf_scan.experiment.models import fit_models
+from torchcrf_scan.experiment.settings import RunConfig
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 SECONDS = "seconds.json"
@@ -79,7 +81,7 @@ def file_name(name: str) -> str:
 
 
 def run_folds(
-    make_study: Callable[[int], Study], folds: Mapping[str, Sequence[Fold]], config: Config, folder: Path, jobs: int
+    make_study: Callable[[int], Study], folds: Mapping[str, Sequence[Fold]], config: RunConfig, folder: Path, jobs: int
 ) -> None:
     """Runs the folds that `folder` lacks; under `torchrun` every rank takes its share and rank 0 ends up with all of them.
 
@@ -115,7 +117,7 @@ def run_fold(study_file: Path, protocol: str, fold: Fold, folder: Path) -> None:
 
 
 @lru_cache(maxsize=1)
-def load_study(place: Path) -> tuple[Study, Config]:
+def load_study(place: Path) -> tuple[Study, RunConfig]:
     """The study of this run, written by the process that started it; a worker reads it once."""
     study, config = pickle.loads(place.read_bytes())
     return study, config

@@ -1,11 +1,12 @@
-"""."""
+"""Settings of the paper's experiment, beside those of a training run."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from torchcrf_scan.checks import choose
 from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.learning.settings import Config
 
 
 @dataclass(frozen=True)
@@ -46,3 +47,14 @@ class ExperimentConfig:
         for name, least in (("test_every", 1), ("resamples", 1), ("jobs", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class RunConfig(Config):
+    """Everything in a configuration file: one run of `train.py` or of `torchcrf-scan experiment`.
+
+    Attributes:
+        experiment: what `torchcrf-scan experiment` does; `train.py` does not look at it.
+    """
+
+    experiment: ExperimentConfig = field(default_factory=ExperimentConfig)

@@ -13,12 +13,13 @@ import numpy as np
 
 from torchcrf_scan.fast.boosting import Stumps, add_margins, double_array, margin, stumps_of
 from torchcrf_scan.features.extension import FARTHEST_EXCESS
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, GATE_WIDTH, KAPPA, LOCAL_CHANNELS, SHAPE_CHANNELS, STATIC_CHANNELS
+from torchcrf_scan.features.scales import GATE_WIDTH, KAPPA
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.messages import exp_below, log_softmax, max_marginals
 from torchcrf_scan.loops.rigid import apply
 from torchcrf_scan.loops.shape import Shape
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, LOCAL_CHANNELS, SHAPE_CHANNELS, STATIC_CHANNELS
 
 REGISTERED, RADIUS = STATIC_CHANNELS, SHAPE_CHANNELS
 LENGTHS = 12  # to three neighbours on either side, straight and along the scan

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from torchcrf_scan.fast.free_space import Sweep, look
-from torchcrf_scan.features.scales import CLUSTERING_WEIGHTS, GATE_WIDTH, KAPPA
+from torchcrf_scan.features.scales import GATE_WIDTH, KAPPA
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.messages import max_marginals
 from torchcrf_scan.loops.nearest import Boxes, nearest
 from torchcrf_scan.loops.rigid import inverse
+from torchcrf_scan.names import CLUSTERING_WEIGHTS
 
 if TYPE_CHECKING:
     from torchcrf_scan.inference.state import Parameters

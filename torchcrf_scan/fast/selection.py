@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from torchcrf_scan.fast.clustering import ClusteringModel, Tables, node_potentials, transition_potentials
-from torchcrf_scan.inference.selection import CAPPED
+from torchcrf_scan.inference.state import CAPPED
 from torchcrf_scan.loops.jit import Array, Booleans, kernel
 from torchcrf_scan.loops.messages import log_partition_without
 

@@ -1,4 +1,4 @@
-"""."""
+"""Settings of learning: from which pairs, by which losses, how fast."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from torchcrf_scan.checks import choose, within
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.data.worlds import WORLDS
-from torchcrf_scan.experiment.settings import ExperimentConfig
+from torchcrf_scan.learning.losses import LOSSES, NO_STEPS, STAGED
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class LearningConfig:
         seed: of everything drawn while learning.
     """
 
-    objective: str = "pseudo_likelihood"
+    objective: str = STAGED
     rotation_noise: float = 0.005
     translation_noise: float = 0.02
     disturbance: float = 0.7
@@ -93,7 +93,7 @@ class LearningConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        choose("objective", self.objective, ("pseudo_likelihood", "likelihood", "unrolled"))
+        choose("objective", self.objective, tuple(LOSSES))
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class GradientConfig:
         seed: of everything drawn: pair k of a run is a function of (seed, k) alone.
     """
 
-    objective: str = "none"
+    objective: str = NO_STEPS
     steps: int = 200
     batch_size: int = 8
     part: int = 4
@@ -177,7 +177,7 @@ class GradientConfig:
     augment: AugmentConfig = field(default_factory=AugmentConfig)
 
     def __post_init__(self) -> None:
-        choose("gradient.objective", self.objective, ("none", "pseudo_likelihood", "likelihood", "unrolled"))
+        choose("gradient.objective", self.objective, (NO_STEPS, *LOSSES))
         choose("gradient.device", self.device, ("auto", "cpu", "cuda"))
         for world in self.worlds:
             choose("gradient.worlds", world, tuple(WORLDS))
@@ -228,10 +228,9 @@ class DataConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """One run of `train.py` or of `torchcrf-scan experiment`.
+    """One training run.
 
     Attributes:
-        experiment: what `torchcrf-scan experiment` does; `train.py` does not look at it.
         output: run folder; resolved config, versions, model, metrics, events and pictures go there.
         overfit: train and test on the first training pair alone, a quick check that everything can learn.
         compare_chains: also fit and evaluate CRF-Matching and CRF-Clustering alone.
@@ -244,25 +243,29 @@ class Config:
     learning: LearningConfig = field(default_factory=LearningConfig)
     gradient: GradientConfig = field(default_factory=GradientConfig)
     unrolled: UnrolledConfig = field(default_factory=UnrolledConfig)
-    experiment: ExperimentConfig = field(default_factory=ExperimentConfig)
     output: str = "runs/default"
     overfit: bool = False
     compare_chains: bool = True
     init: str = ""
 
     def __post_init__(self) -> None:
-        other = self.gradient.objective
-        if self.learning.objective == "unrolled" and other not in ("none", "unrolled"):
-            raise ValueError(f"gradient.objective: expected unrolled with learning.objective unrolled, got {other}")
-        if self.init and self.first_order == "none":
+        other, staged = self.gradient.objective, self.learning.objective
+        if not LOSSES[staged].is_staged and other not in (NO_STEPS, staged):
+            raise ValueError(f"gradient.objective: expected {staged} with learning.objective {staged}, got {other}")
+        if self.init and not self.has_steps:
             raise ValueError(f"init: expected a gradient.objective to go on with from {self.init}, got none")
 
     @property
     def first_order(self) -> str:
         """The loss of first-order training: `none`, or one of `GradientConfig.objective`."""
-        return "unrolled" if self.learning.objective == "unrolled" else self.gradient.objective
+        return self.gradient.objective if LOSSES[self.learning.objective].is_staged else self.learning.objective
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether there is first-order training."""
+        return self.first_order != NO_STEPS
 
     @property
     def staged(self) -> LearningConfig:
-        """How the staged fit learns: what goes on through the unrolled iterations begins with pseudo-likelihood."""
-        return replace(self.learning, objective="pseudo_likelihood") if self.learning.objective == "unrolled" else self.learning
+        """How the staged fit learns: a loss that it does not know goes on from the fit of `STAGED`."""
+        return self.learning if LOSSES[self.learning.objective].is_staged else replace(self.learning, objective=STAGED)

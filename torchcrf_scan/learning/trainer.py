@@ -42,6 +42,7 @@ from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.variants.register import ONE_CHAINS
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +58,7 @@ def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]
 
     resume: go on from the checkpoint in the run folder, where there is one; else begin anew.
     """
-    with join(config.gradient.device if config.first_order != "none" else "cpu") as ranks:
+    with join(config.gradient.device if config.has_steps else "cpu") as ranks:
         return train_together(config, ranks, resume=resume)
 
 
@@ -84,14 +85,14 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
     with RunLog(folder) if ranks.is_first else nullcontext() as run:
         model = JointScanCRF(config.model)
         material = prepare(model, train_pairs, config, run, state) if run is not None else []
-        if config.first_order != "none":
+        if config.has_steps:
             ranks.share_weights(model)
             first_step = state["step"] + 1 if state else None
             with TrainingMonitor(folder, config, first_step) if ranks.is_first else nullcontext() as monitor:
                 train_by_gradient(model, config, train_pairs, held_out, store, ranks, monitor, state=state)
         cascade = None
         if run is not None:
-            if config.first_order != "none" and model.config.chains == "joint":
+            if config.has_steps and model.config.has_association and model.config.has_clusters:
                 model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
             calibrate(model, material)
             cascade = fit_baselines(material, config, run)
@@ -106,9 +107,9 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
             run.picture(test_pairs[k], answers["joint"][k], step)
         for method, of_method in scores.items():
             run.metrics(method, summarise(of_method))
-        if config.first_order == "none" and scores["joint"]:
+        if not config.has_steps and scores["joint"]:
             run.settings(flatten(config), summarise(scores["joint"]))
-    if config.first_order != "none" and scores["joint"]:
+    if config.has_steps and scores["joint"]:
         with TrainingMonitor(folder, config, config.gradient.steps + 1) as monitor:
             monitor.finished(flatten(config), summarise(scores["joint"]), config.gradient.steps)
     tables = report(scores) if scores["joint"] else []
@@ -122,7 +123,7 @@ def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], lis
     Raises:
         ValueError: too few sequences to hold one out.
     """
-    if config.first_order == "none" or config.gradient.validation == 0 or config.overfit:
+    if not config.has_steps or config.gradient.validation == 0 or config.overfit:
         return pairs, []
     try:
         return split_by_sequence(pairs, config.gradient.validation, config.gradient.seed)
@@ -194,7 +195,7 @@ def refuse_leaks(train_pairs: Sequence[ScanPair], test_pairs: Sequence[ScanPair]
 
 def fit_baselines(material: list[Material], config: Config, run: RunLog) -> Cascade | None:
     """Fits each chain alone where asked for, from the same start."""
-    if not config.compare_chains or config.model.chains != "joint":
+    if not (config.compare_chains and config.model.has_association and config.model.has_clusters):
         return None
     learning = replace(config, learning=config.staged)
     return fit_cascade(material, learning, {method: watches(run, method) for method in ("matching", "clustering")})
@@ -219,7 +220,7 @@ def watches(run: RunLog, method: str) -> dict[str, Watch]:
 
         return look
 
-    return {chain: watch(chain) for chain in ("association", "clustering", "lattice")}
+    return {chain: watch(chain) for chain in ("association", "clustering", *ONE_CHAINS)}
 
 
 @torch.no_grad()

@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.features.shape import MIN_ARM, ORDERS
 from torchcrf_scan.loops.jit import Array, kernel
 from torchcrf_scan.loops.median import lower_median
 
+ORDERS = (1, 3, 5)  # "first, third or fifth neighbour"
+MIN_ARM = 1e-6  # metres; the angle between shorter arms is undefined and called straight
 FARTHEST = max(ORDERS)
 NO_SPACING = 0.1  # metres, of two scans without points
 

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 
 from torchcrf_scan.features.potentials import REFERENCE_UNIT
-from torchcrf_scan.features.scales import KAPPA, SHAPE_CHANNELS, Scales
+from torchcrf_scan.features.scales import KAPPA, Scales
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.shape import Shape, describe, resolution
+from torchcrf_scan.names import SHAPE_CHANNELS
 from torchcrf_scan.search.surface import Surface
 
 CANDIDATES = 32
