@@ -7,7 +7,7 @@ converts and checks them all where the dataclass is made, whoever makes it: a co
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from numbers import Integral, Real
@@ -69,12 +69,13 @@ def check_fields(settings: Any, prefix: str = "") -> None:
     Raises:
         ValueError: a value of another type, not finite, or out of bounds.
     """
-    for name, hint in _annotations(type(settings)).items():
+    kind: Any = type(settings)
+    for name, hint in _annotations(kind).items():
         value = getattr(settings, name)
         object.__setattr__(settings, name, _converted(f"{prefix}{name}", hint, value))
 
 
-def from_values(kind: type[Settings], values: object, name: str) -> Settings:
+def from_values(kind: Callable[..., Settings], values: object, name: str) -> Settings:
     """Settings from what `asdict` made of them, as a file holds it; what is missing there has its default.
 
     Raises:
