@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.scan import Floats, Scan, ScanPair
+from torchcrf_scan.scan import FARTHEST, Floats, Scan, ScanPair
 from torchcrf_scan.tree import tensor_tree
 
 
@@ -189,8 +189,8 @@ def initial_motion_of(pair: ScanPair) -> Floats:
     if pair.initial_motion is None:
         return np.zeros(3)
     guess = np.asarray(pair.initial_motion, dtype=np.float64)
-    if guess.shape != (3,) or not np.isfinite(guess).all():
-        raise ValueError(f"initial_motion: expected three finite numbers (theta, tx, ty), got {pair.initial_motion!r}")
+    if guess.shape != (3,) or not (np.abs(guess) <= FARTHEST).all():
+        raise ValueError(f"initial_motion: expected three finite numbers (theta, tx, ty) within {FARTHEST:g}, got {guess.tolist()}")
     return guess
 
 

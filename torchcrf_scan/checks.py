@@ -14,8 +14,11 @@ from numbers import Integral, Real
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 Settings = TypeVar("Settings")
 
+UNIONS = (Union, UnionType)
 SHOWN = 80  # letters of a wrong value that a message repeats
 
 
@@ -100,29 +103,29 @@ def _annotations(kind: Any) -> dict[str, Any]:
 def _converted(name: str, hint: Any, value: Any) -> Any:
     """The value as the annotation has it."""
     base, bounds = (hint.__origin__, hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
-    if get_origin(base) is tuple and isinstance(value, list | tuple):
-        return tuple(_converted(name, get_args(base)[0], of) for of in value)
-    if get_origin(base) in (Union, UnionType):
-        suiting = [of for of in get_args(base) if _suits(of, value)]
-        base = suiting[0] if suiting else base
-        return _converted(name, base, value) if suiting else _refuse(name, hint, value)
     if not _suits(base, value):
-        return _refuse(name, hint, value)
-    value = base(value) if base in (bool, int, float, str) else value
-    if not all(bound.allows(value) for bound in bounds):
-        return _refuse(name, hint, value)
-    return value
+        raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
+    if get_origin(base) in UNIONS:
+        base = next(of for of in get_args(base) if _suits(of, value))
+    if get_origin(base) is tuple:
+        return tuple(_converted(name, get_args(base)[0], of) for of in value)
+    converted = base(value) if base in (bool, int, float) else value
+    if not all(bound.allows(converted) for bound in bounds):
+        raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
+    return converted
 
 
 def _suits(base: Any, value: Any) -> bool:
     """Whether a value is of a type, or can be converted to it without loss; numbers must be finite."""
-    if base is float:
-        return isinstance(value, Real) and not isinstance(value, bool) and _is_finite(value)
-    if base is int:
-        return isinstance(value, Integral) and not isinstance(value, bool)
+    if get_origin(base) in UNIONS:
+        return any(_suits(of, value) for of in get_args(base))
     if get_origin(base) is tuple:
         return isinstance(value, list | tuple)
-    return isinstance(value, base)
+    if base is bool or isinstance(value, bool):
+        return base is bool and isinstance(value, bool | np.bool_)
+    if base is float:
+        return isinstance(value, Real) and _is_finite(value)
+    return isinstance(value, Integral if base is int else base)
 
 
 def _is_finite(value: Real) -> bool:
@@ -132,19 +135,15 @@ def _is_finite(value: Real) -> bool:
         return False
 
 
-def _refuse(name: str, hint: Any, value: Any) -> Any:
-    raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
-
-
 def _description(hint: Any) -> str:
     """What an annotation allows, in words."""
     if get_origin(hint) is Annotated:
         bounds = "".join(map(str, hint.__metadata__))
         return bounds.removeprefix(": ") if hint.__origin__ is str else _description(hint.__origin__) + bounds
-    if get_origin(hint) in (Union, UnionType):
+    if get_origin(hint) in UNIONS:
         return " or ".join(map(_description, get_args(hint)))
-    known = {int: "a whole number", float: "a finite number", bool: "true or false", str: "a text"}
-    return known.get(hint, "a list" if get_origin(hint) is tuple else f"a {getattr(hint, '__name__', hint)}")
+    known = {int: "a whole number", float: "a finite number", bool: "true or false", str: "a text", type(None): "nothing"}
+    return known.get(hint, "a list" if get_origin(hint) is tuple else f"settings ({getattr(hint, '__name__', hint)})")
 
 
 def _shown(value: object) -> str:

@@ -84,10 +84,10 @@ def pair_of_scans(pair: ScanPair, dtype: torch.dtype) -> Pair:
         rounded("target", pair.target.points),
         pair.source.is_closed,
         pair.target.is_closed,
-        float(rounded("range_noise", range_noise_of(pair))),
+        rounded("range_noise", range_noise_of(pair)).item(),
         rounded("initial_motion", initial_motion_of(pair)),
         np.zeros(2),
-        float(rounded("dt", pair.dt)),
+        rounded("dt", pair.dt).item(),
     )
 
 
