@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +28,7 @@ from torchcrf_scan.inference.uncertainty import Calibration
 from torchcrf_scan.loops.pair import pair_of_scans
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.prediction import Prediction
-from torchcrf_scan.pretrained import PRETRAINED, find_weights, model_config
+from torchcrf_scan.pretrained import PRETRAINED, find_weights, load_state, read_config, write_model
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 from torchcrf_scan.search.accept import score_of
 from torchcrf_scan.search.pairs import initialise, start_pairs
@@ -264,19 +262,8 @@ class JointScanCRF(nn.Module):
         return [by_beam(answer, pair) for answer, pair in zip(answers, pairs, strict=True)]
 
     def save_pretrained(self, folder: str | Path) -> None:
-        """Writes `config.json` and `model.safetensors` into a folder, each whole or not at all."""
-        from safetensors.torch import save
-
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        contents = {
-            "config.json": (json.dumps(asdict(self.config), indent=2) + "\n").encode(),
-            "model.safetensors": save({name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}),
-        }
-        for name, content in contents.items():
-            temporary = folder / f".{name}.{os.getpid()}"
-            temporary.write_bytes(content)
-            os.replace(temporary, folder / name)
+        """Writes `config.json` and `model.safetensors` into a folder, see `pretrained`."""
+        write_model(Path(folder), self.config, self.state_dict())
 
     @classmethod
     def from_pretrained(
@@ -288,19 +275,14 @@ class JointScanCRF(nn.Module):
             name_or_path: a folder, or a name under `torchcrf_scan/weights`.
             features: `smooth`, `learn_stumps` or `embedding` of `FeatureConfig` to change; weights that the saved model has not
                 begin as in a new one.
-            inference: fields of `InferenceConfig` to change, e.g. `candidates=0`.
-        """
-        from safetensors.torch import load
+            inference: fields of `InferenceConfig` to change, e.g. `candidates=0`, `backend="eager"`.
 
+        Raises:
+            ValueError: no such model, a damaged one, weights that are not finite, or a value that is out of bounds.
+        """
         folder = find_weights(name_or_path)
-        config = model_config(json.loads((folder / "config.json").read_text()))
-        if inference:
-            config = replace(config, inference=replace(config.inference, **inference))
-        if features:
-            config = replace(config, features=replace(config.features, **features))
-        model = cls(config)
-        saved = load((folder / "model.safetensors").read_bytes())
-        model.load_state_dict({**model.embedding_state, **saved} if features else saved)
+        model = cls(read_config(folder, features or {}, inference))
+        load_state(model, folder, model.embedding_state if features else {})
         return model.eval()
 
     @property

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from safetensors import SafetensorError
 
 from torchcrf_scan.commands.failures import attempt
 from torchcrf_scan.data.dataset import PairFiles
@@ -31,7 +30,7 @@ def load_model(name: str, candidates: int | None = None, device: str = "cpu", th
     changes: dict[str, Any] = {} if candidates is None else {"candidates": candidates}
     try:
         model = JointScanCRF.from_pretrained(name, **changes)
-    except (ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
+    except ValueError as error:
         raise ValueError(f"--model {name}: {error}") from error
     try:
         return model.to(device)

@@ -21,6 +21,7 @@ from torchcrf_scan.data.pair_file import read_pair, read_prediction
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.whole_file import write_whole
 
 if TYPE_CHECKING:
     from torchcrf_scan.evaluation.metrics import PairScore
@@ -102,7 +103,7 @@ def evaluate(
         figures |= _displaced_figures(displacement, seed, scores)
     print("\n".join(table.to_markdown() for table in tables), end="")
     if json is not None:
-        Path(json).write_text(json_format.dumps(figures, indent=2) + "\n")
+        write_whole(Path(json), json_format.dumps(figures, indent=2) + "\n")
     return 0
 
 

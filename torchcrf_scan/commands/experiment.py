@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 from jsonargparse import ArgumentError, ArgumentParser
 
+from torchcrf_scan.experiment.parser import config_of, load_yaml, settings_parser
 from torchcrf_scan.experiment.settings import RunConfig
 
 
@@ -24,7 +25,7 @@ def experiment(*, ablations: str | None = None, **settings: Any) -> int:
     """
     from torchcrf_scan.experiment.experiment import run_ablations, run_experiment
 
-    config = RunConfig(**{name: value for name, value in settings.items() if name != "config"})
+    config = config_of(settings)
     if config.has_steps and config.model.encoder.width == 0:
         got = config.first_order
         raise ValueError(f"gradient.objective: expected none in an experiment without model.encoder (it fits in stages), got {got}")
@@ -42,9 +43,7 @@ def experiment(*, ablations: str | None = None, **settings: Any) -> int:
 def experiment_parser(summary: str) -> ArgumentParser:
     """Options: every setting, from YAML files and one by one."""
     usage = "torchcrf-scan experiment [--config CONFIG.yaml] [--ablations FOLDER] --output OUTPUT [settings]"
-    parser = ArgumentParser(description=summary, usage=usage)
-    parser.add_argument("--config", action="config", help="YAML file of settings")
-    parser.add_class_arguments(RunConfig)
+    parser = settings_parser(description=summary, usage=usage)
     parser.add_argument("--ablations", type=str | None, help="folder of YAML files, each a variant: prints one table of them")
     return parser
 
@@ -58,8 +57,7 @@ def read_variants(folder: Path, config: RunConfig) -> dict[str, RunConfig]:
     files = sorted(folder.glob("*.yaml"))
     if not files:
         raise ValueError(f"--ablations {folder}: expected a folder of .yaml files, got none")
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_class_arguments(RunConfig)
+    parser = settings_parser(exit_on_error=False)
     variants: dict[str, RunConfig] = {}
     config = replace(config, experiment=replace(config.experiment, leave_out=()))
     for file in files:
@@ -77,10 +75,10 @@ def read_variants(folder: Path, config: RunConfig) -> dict[str, RunConfig]:
 def read_variant(parser: ArgumentParser, file: Path, config: RunConfig) -> RunConfig:
     """`config` with the settings of one file changed."""
     try:
-        changes = yaml.safe_load(file.read_text()) or {}
+        changes = load_yaml(file.read_text()) or {}
         if not isinstance(changes, dict):
             raise ValueError(f"expected settings, one a line as NAME: VALUE, got {changes!r}")
         base = parser.parse_object(asdict(config))
-        return RunConfig(**vars(parser.instantiate(parser.parse_object(changes, base))))
+        return config_of(parser.instantiate(parser.parse_object(changes, base)))
     except (ArgumentError, yaml.YAMLError, ValueError, TypeError) as error:
         raise ValueError(f"{file}: {error}") from error

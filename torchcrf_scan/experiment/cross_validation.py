@@ -5,6 +5,7 @@ A finished fold is a folder `PROTOCOL/FOLD/` with `METHOD/PAIR.npz` predictions 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import pickle
@@ -31,6 +32,7 @@ from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 SECONDS = "seconds.json"
+LONGEST = 100  # bytes of a name that files are named by; of a longer one the beginning and a digest
 PATIENCE = timedelta(days=7)  # that a machine waits for the others' folds
 
 
@@ -76,8 +78,10 @@ def make_folds(protocol: str, pairs: Sequence[ScanPair], tested: int, every: int
 
 
 def file_name(name: str) -> str:
-    """A name as part of a path."""
-    return re.sub(r"[^\w.+-]+", "_", name).strip("_") or "unnamed"
+    """A name as part of a path: never one that leads elsewhere (`..`), nor one that is too long for a file."""
+    whole = name.encode(errors="surrogatepass")
+    short = name if len(whole) <= LONGEST else f"{name[: LONGEST // 4]}_{hashlib.sha256(whole).hexdigest()[:12]}"
+    return re.sub(r"[^\w.+-]+", "_", short).strip("_.") or "unnamed"
 
 
 def run_folds(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -29,6 +28,7 @@ from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning.run_log import RunLog
 from torchcrf_scan.scan import Ints, PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_associations, plot_clusters, save_figure
+from torchcrf_scan.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -259,10 +259,3 @@ def write_tables(folder: Path, name: str, tables: Sequence[Table]) -> None:
     write_whole(folder / f"{name}.md", "\n\n".join(table.to_markdown() for table in tables) + "\n")
     for table in tables:
         write_whole(folder / f"{name}_{file_name(table.title.split(' (')[0].split(':')[0])}.csv".lower(), table.to_csv())
-
-
-def write_whole(path: Path, content: str) -> None:
-    """The file appears whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(content)
-    os.replace(temporary, path)

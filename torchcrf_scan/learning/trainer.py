@@ -9,12 +9,13 @@ import subprocess
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from torch import Tensor
 from tqdm import tqdm
 
@@ -29,7 +30,7 @@ from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.cascade_fit import fit_cascade
-from torchcrf_scan.learning.checkpoint import Store, load_weights, write_bytes
+from torchcrf_scan.learning.checkpoint import Store, load_weights
 from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.material import Material, collect
@@ -43,6 +44,7 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import PairPrediction, ScanPair
 from torchcrf_scan.variants.register import ONE_CHAINS
+from torchcrf_scan.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +66,7 @@ def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]
 
 def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dict[str, list[PairScore]]:
     """This process's share of `train`."""
-    folder = Path(config.output)
+    folder, resolved = Path(config.output), yaml.safe_dump(asdict(config), sort_keys=False)
     folder.mkdir(parents=True, exist_ok=True)
     train_pairs, test_pairs = load_data(config.data)
     if config.overfit:
@@ -78,8 +80,10 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
     began = time.perf_counter()
     store = Store(folder, settings_of(config))
     state = ranks.share(store.read() if resume and ranks.is_first else None)
-    if not resume and ranks.is_first:
-        store.path.unlink(missing_ok=True)  # of another run: this one must not go on from there
+    if ranks.is_first:
+        if not resume:
+            store.path.unlink(missing_ok=True)  # of another run: this one must not go on from there
+        write_whole(folder / "config.yaml", resolved)  # not before a run with other settings has been refused
     if resume:
         log.info("going on from step %d" if state else "no checkpoint yet, beginning anew", *([state["step"]] if state else []))
     with RunLog(folder) if ranks.is_first else nullcontext() as run:
@@ -172,6 +176,8 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
 
 def load_data(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
     """Training and test pairs: files, then simulated worlds."""
+    if not config.train and not config.simulate_train:
+        raise ValueError("data.simulate_train: expected a world at least where data.train names no files, got none")
 
     def load(patterns: tuple[str, ...] | str, worlds: tuple[str, ...], seed: int) -> list[ScanPair]:
         patterns = (patterns,) if isinstance(patterns, str) else patterns
@@ -270,7 +276,7 @@ def write_results(folder: Path, scores: dict[str, list[PairScore]], tables: Sequ
         "versions.json": json.dumps(versions(), indent=2) + "\n",
     }
     for name, content in contents.items():
-        write_bytes(folder / name, content.encode())
+        write_whole(folder / name, content)
 
 
 def versions() -> dict[str, str]:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcrf_scan.batch import ScanPairBatch, initial_motion_of, range_noise_of
+from torchcrf_scan.batch import ScanPairBatch, finite, initial_motion_of, range_noise_of
 from torchcrf_scan.loops.jit import Array, Booleans, Integers
 from torchcrf_scan.scan import ScanPair
 
@@ -76,20 +76,18 @@ def pair_of(batch: ScanPairBatch, b: int) -> Pair:
 def pair_of_scans(pair: ScanPair, dtype: torch.dtype) -> Pair:
     """The pair as `ScanPairBatch.collate` would have it in a dtype, so that `match` and `forward` give the same labels."""
 
-    def rounded(values: NDArray) -> Array:
-        return array_of(torch.from_numpy(values).to(dtype))
-
-    noise, dt = rounded(np.array([range_noise_of(pair), pair.dt]))
+    def rounded(name: str, values: NDArray | float) -> Array:
+        return array_of(finite(name, torch.as_tensor(values, dtype=torch.float64).to(dtype)))
 
     return Pair(
-        rounded(pair.source.points),
-        rounded(pair.target.points),
+        rounded("source", pair.source.points),
+        rounded("target", pair.target.points),
         pair.source.is_closed,
         pair.target.is_closed,
-        float(noise),
-        rounded(initial_motion_of(pair)),
+        rounded("range_noise", range_noise_of(pair)).item(),
+        rounded("initial_motion", initial_motion_of(pair)),
         np.zeros(2),
-        float(dt),
+        rounded("dt", pair.dt).item(),
     )
 
 
