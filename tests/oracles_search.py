@@ -196,6 +196,44 @@ def gauss_newton_step(
     return theta, centre[0] - back[0] + dx, centre[1] - back[1] + dy
 
 
+def follow(motion: Motion, step: Motion) -> tuple[float, float, float]:
+    """A motion, then a step."""
+    return (oracles.wrap(motion[0] + step[0]), *move(step, motion[1:]))
+
+
+def robust(residual: float, gate: float) -> float:
+    """Geman-McClure weight."""
+    return 1 / (1 + (residual / gate) ** 2) ** 2
+
+
+def register(
+    source: Surface, weights: np.ndarray, target: Surface, motion: Motion, gates: Sequence[float], along: Sequence[float]
+) -> Motion:
+    """Source points on nearest target points, by steps with narrowing gates."""
+    for gate, slack in zip(gates, along, strict=True):
+        moved = np.array([move(motion, p) for p in source.points])
+        pairs = [nearest(target.points, p) for p in moved]
+        trust = [robust(distance, gate + target.spacing[j] / 2) for distance, j in pairs]
+        partner, tangent = (np.array([of[j] for _, j in pairs]) for of in (target.points, target.tangent))
+        motion = follow(motion, gauss_newton_step(moved, partner, tangent, weights * trust, slack))
+    return motion
+
+
+def register_both(source: Surface, target: Surface, motion: Motion, gates: Sequence[float], along: Sequence[float]) -> Motion:
+    """Both scans on each other in one step, weighted by the residual to the other's surface."""
+    for gate, slack in zip(gates, along, strict=True):
+        moved = [move(motion, p) for p in source.points]
+        rows = []
+        for p in moved:
+            residual, j = surface_residual(target, p)
+            rows.append((p, target.points[j], target.tangent[j], robust(residual, gate)))
+        for q in target.points:
+            residual, i = surface_residual(source, move(invert(motion), q))
+            rows.append((moved[i], q, move((motion[0], 0.0, 0.0), source.tangent[i]), robust(residual, gate)))
+        motion = follow(motion, gauss_newton_step(*(np.array(column) for column in zip(*rows, strict=True)), slack))
+    return motion
+
+
 # Sets of points that may be one object.
 
 

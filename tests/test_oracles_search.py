@@ -108,6 +108,16 @@ def test_a_gauss_newton_step_of_two_points() -> None:
     assert oracles.gauss_newton_step(points, turned, none, 0 * weights, 1.0) == (0.0, 0.0, 0.0)
 
 
+def test_registration_by_hand() -> None:
+    assert oracles.follow((math.pi / 2, 1.0, 0.0), (math.pi, 0.0, 2.0)) == pytest.approx((-math.pi / 2, -1.0, 2.0))
+    assert oracles.robust(0.3, 0.3) == 0.25
+    post, moved = (oracles.surface(np.array([[x, 0.0]]), 0.0, closed=False) for x in (4.0, 4.1))
+    found = oracles.register(post, np.ones(1), moved, (0.0, 0.0, 0.0), [1.0], [1.0])
+    assert found == pytest.approx((0.0, 0.1 / 1.001, 0.0))
+    assert oracles.register_both(post, moved, (0.0, 0.0, 0.0), [1.0], [1.0]) == pytest.approx((0.0, 0.1 / 1.001, 0.0))
+    assert oracles.register(post, np.zeros(1), moved, (0.1, 0.2, 0.3), [1.0], [1.0]) == pytest.approx((0.1, 0.2, 0.3))
+
+
 def test_ends_and_samples_of_sets() -> None:
     assert oracles.ends([2, 3, 5], 10) == (2, 5)
     assert oracles.ends([0, 1, 8, 9], 10) == (8, 1)
