@@ -9,8 +9,6 @@ import torch
 from support import generator, make_points, normal
 from torch import Tensor
 
-pytest.importorskip("numba")
-
 from torchcrf_scan.fast import motion
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import motion as eager

@@ -9,8 +9,6 @@ import torch
 from support import make_points, normal
 from torch import Tensor
 
-pytest.importorskip("numba")
-
 from torchcrf_scan import JointScanCRF
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.pair_file import read_pair

@@ -3,8 +3,6 @@ import pytest
 import torch
 from support import generator, normal
 
-pytest.importorskip("numba")
-
 from torchcrf_scan.fast.boosting import margins, stumps_of
 from torchcrf_scan.features.boosting import StumpEnsemble
 

@@ -1,6 +1,5 @@
 """What beams say of points, against the eager functions."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -9,11 +8,8 @@ import torch
 from support import all_real, make_points, normal
 from torch import Tensor
 
-pytest.importorskip("numba")
-
 from torchcrf_scan.fast.free_space import look, sweep_of
 from torchcrf_scan.features import free_space as eager
-from torchcrf_scan.loops.circle import first_from, within_circle
 
 HERE = torch.tensor([1.0, 2.0], dtype=torch.float64)
 SCANS = {
@@ -55,14 +51,3 @@ def test_looks_agree_with_the_eager_ones(name: str, shift: float) -> None:
 def test_a_scan_without_points_says_nothing() -> None:
     sweep = sweep_of(np.empty((0, 2)), 0.02, False, np.zeros(2))
     assert look(sweep, 1.0, 1.0) == (0.0, 0.0)
-
-
-def test_search_finds_the_first_that_is_not_below() -> None:
-    rising = np.array([0.0, 1.0, 1.0, 3.0])
-    for value in (-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 4.0):
-        assert first_from(rising, value) == np.searchsorted(rising, value)
-
-
-@pytest.mark.parametrize("angle", [-20.0, -math.tau, -1.0, 0.0, 1.0, math.tau, 30.0])
-def test_circles_are_those_of_the_remainder(angle: float) -> None:
-    assert within_circle(angle) == pytest.approx(angle % math.tau)

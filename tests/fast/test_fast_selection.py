@@ -9,8 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-pytest.importorskip("numba")
-
 from torchcrf_scan import JointScanCRF
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
@@ -21,6 +19,8 @@ from torchcrf_scan.inference import selection as eager
 from torchcrf_scan.inference.joint import first_state
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import State
+from torchcrf_scan.loops.pair import pair_of
+from torchcrf_scan.search.pairs import start_arrays
 
 
 @cache
@@ -51,8 +51,9 @@ def test_evidence_and_choice_agree_with_the_eager_ones(seed: int, odds: float) -
     batch, view, start, state = considered(seed)
     fitted, config = layer().fitted, layer().config
     learned, settings = decode.learned_of(fitted), decode.settings_of(config)
-    begin = decode.start_of(start, 0, batch.source.shape[1], batch.target.shape[1])
-    scene = decode.scene_of(decode.pair_of(batch, 0), begin, settings)
+    pair = pair_of(batch, 0)
+    begin, none = start_arrays(start, 0, pair), np.zeros(len(pair.source))
+    scene = decode.scene_of(pair, begin, none, none, settings)
     ours = decode.first_state(scene, begin, False, settings)
     tables = decode.tables_of(scene, ours, learned.clustering)
     scaled = start.scaled(view.factor).considered()
@@ -69,8 +70,9 @@ def test_evidence_and_choice_agree_with_the_eager_ones(seed: int, odds: float) -
 def test_the_background_alone_is_never_asked() -> None:
     batch, _, start, _ = considered(0)
     learned, settings = decode.learned_of(layer().fitted), decode.settings_of(layer().config)
-    begin = decode.start_of(start, 0, batch.source.shape[1], batch.target.shape[1])
-    scene = decode.scene_of(decode.pair_of(batch, 0), begin, settings)
+    pair = pair_of(batch, 0)
+    begin, none = start_arrays(start, 0, pair), np.zeros(len(pair.source))
+    scene = decode.scene_of(pair, begin, none, none, settings)
     state = decode.first_state(scene, begin, True, settings)
     state.active[1:] = False
     selection.discard_vacuous(

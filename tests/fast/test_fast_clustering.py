@@ -10,8 +10,6 @@ import torch
 from support import all_real, generator, make_points, normal
 from torch import Tensor
 
-pytest.importorskip("numba")
-
 from torchcrf_scan import JointScanCRF
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.fast import clustering

@@ -10,8 +10,6 @@ import torch
 from support import generator, make_points, normal
 from torch import Tensor
 
-pytest.importorskip("numba")
-
 from torchcrf_scan.fast import uncertainty
 from torchcrf_scan.fast.motion import METRICS
 from torchcrf_scan.geometry import se2

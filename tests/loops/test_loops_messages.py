@@ -5,8 +5,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-pytest.importorskip("numba")
-
 from torchcrf_scan.inference.messages import chain_beliefs, log_partition
 from torchcrf_scan.loops import messages
 
