@@ -394,7 +394,7 @@ def features_of_shift(
     turned = [move((heading, 0.0, 0.0), source.tangent[i]) for i in sample]
     return {
         "displacement": math.log1p(length / unit),
-        "displacement_in_spacings": math.log1p(length / (reach * source.step)),
+        "displacement_in_spacings": math.log1p(length / (reach * source.step)) if source.step > 0 else math.inf,
         "displacement_in_range": length / reach,
         "displacement_in_extent": math.log1p(length / max(long, 1e-6)),
         "along_surface": sum(abs(tx * x + ty * y) for tx, ty in turned) / len(sample) / length,
