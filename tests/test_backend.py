@@ -1,4 +1,4 @@
-"""Which engine runs the rounds, and that both answer alike: batches, threads, priors, scans with hardly a point."""
+"""Both engines of the rounds answer alike: batches, threads, priors, scans with hardly a point."""
 
 from collections.abc import Iterator
 from dataclasses import fields, replace
@@ -8,15 +8,12 @@ import pytest
 import torch
 
 from torchcrf_scan import JointScanCRF, Scan, ScanPair, ScanPairBatch
-from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.fast.choice import can_decode, can_run
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.prediction import Prediction
 
-CPU = torch.device("cpu")
 SCANNER = SimulatorConfig(beams=121)
 
 
@@ -143,38 +140,3 @@ def test_an_empty_scan_is_answered_and_changes_no_other_answer(
     by_beam = compiled.match_pairs([pairs[0], nothing, pairs[1]])[1]
     assert by_beam.association.tolist() == [-1] * 9
     assert np.isfinite(by_beam.motions).all()
-
-
-@pytest.mark.parametrize(
-    ("config", "reason"),
-    [
-        (ModelConfig(inference=InferenceConfig(schedule="flooding", backend="compiled")), "schedule: flooding"),
-        (ModelConfig(inference=InferenceConfig(temperature=1.0, backend="compiled")), "temperature: 1.0"),
-        (ModelConfig(coupling="lattice", inference=InferenceConfig(backend="compiled")), "coupling: lattice"),
-        (ModelConfig(chains="matching", inference=InferenceConfig(backend="compiled")), "chains: matching"),
-    ],
-)
-def test_what_is_not_compiled_is_said(config: ModelConfig, reason: str) -> None:
-    with pytest.raises(ValueError, match=f"backend: expected for compiled .*{reason}"):
-        can_decode(config, CPU)
-    automatic = replace(config, inference=replace(config.inference, backend="auto"))
-    assert not can_decode(automatic, CPU)
-
-
-def test_loops_run_where_points_are_on_the_cpu_and_nothing_else_is_asked_for() -> None:
-    elsewhere = torch.device("meta")
-    assert [can_run(backend, CPU) for backend in ("auto", "compiled", "eager")] == [True, True, False]
-    assert not can_run("auto", elsewhere)
-    with pytest.raises(ValueError, match="backend: expected for compiled scans on the CPU, got meta"):
-        can_run("compiled", elsewhere)
-    assert can_decode(ModelConfig(), CPU)
-    assert not can_decode(ModelConfig(inference=InferenceConfig(backend="eager")), CPU)
-    assert not can_decode(ModelConfig(), elsewhere)
-    with pytest.raises(ValueError, match="no embeddings"):
-        can_decode(ModelConfig(inference=InferenceConfig(backend="compiled")), CPU, has_embeddings=True)
-
-
-def test_a_gradient_needs_tensors() -> None:
-    assert not can_decode(ModelConfig(), CPU, needs_gradient=True)
-    with pytest.raises(ValueError, match="no gradient"):
-        can_decode(ModelConfig(inference=InferenceConfig(backend="compiled")), CPU, needs_gradient=True)

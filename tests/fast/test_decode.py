@@ -16,11 +16,8 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.fast import decode, kept_candidates
-from torchcrf_scan.fast.candidates import by_motion
-from torchcrf_scan.geometry import se2
+from torchcrf_scan.fast import decode
 from torchcrf_scan.inference.start import Start
-from torchcrf_scan.loops.nearest import boxes_of
 from torchcrf_scan.loops.pair import pair_of
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.search.pairs import start_arrays
@@ -235,16 +232,3 @@ def test_a_tie_may_be_broken_either_way() -> None:
     }
     whole = replace(expected, log_cluster=torch.cat([tied, *[expected.log_cluster] * (many - 1)], 1), **repeated)
     assert np.flatnonzero(~assert_same_labels(several, whole)).tolist() == [0]
-
-
-@pytest.mark.parametrize("count", [0, 1, 5, 59, 60, 80])
-def test_kept_candidates_are_the_ones_that_a_search_finds(count: int) -> None:
-    source, target = make_points(50, 1).numpy(), make_points(60, 2).numpy()
-    boxes, motions, active = boxes_of(target), 0.1 * normal(3, 3, seed=4).numpy(), np.array([True, True, False])
-    kept = kept_candidates.kept_of(50, 60, 3, count)
-    for step in range(12):
-        motions = motions + 0.3 ** (step % 6) * 0.1 * normal(3, 3, seed=step).numpy()
-        active = np.array([True, step % 5 < 3, step > 8])
-        moved = se2.apply(torch.from_numpy(motions), torch.from_numpy(source)).numpy()
-        kept_candidates.update(kept, boxes, source, moved, motions, active)
-        np.testing.assert_array_equal(kept.index, by_motion(boxes, source, motions, active, count)[0])

@@ -10,7 +10,6 @@ from support import normal
 
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.loops import rigid
-from torchcrf_scan.loops.median import lower_median
 
 
 @given(st.floats(-7, 7), st.integers(0, 10_000))
@@ -28,10 +27,3 @@ def test_they_are_those_of_arrays(theta: float, seed: int) -> None:
 @pytest.mark.parametrize(("angle", "wrapped"), [(0.0, 0.0), (math.pi, math.pi), (-math.pi, math.pi), (4.0, 4.0 - math.tau)])
 def test_wrap(angle: float, wrapped: float) -> None:
     assert rigid.wrap(angle) == pytest.approx(wrapped)
-
-
-@pytest.mark.parametrize(
-    ("values", "median"), [([3.0], 3.0), ([4.0, 1.0], 1.0), ([5.0, 1.0, 3.0], 3.0), ([4.0, 4.0, 2.0, 9.0], 4.0)]
-)
-def test_the_lower_median(values: list[float], median: float) -> None:
-    assert lower_median(np.array(values, np.float64)) == median

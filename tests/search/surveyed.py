@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import oracles_movers
 import oracles_search as oracles
 import torch
 from hypothesis import strategies as st
@@ -100,9 +101,9 @@ class Surveyed:
         return [np.flatnonzero(row).tolist() for row in rows]
 
     @cached_property
-    def scene(self) -> oracles.Scene:
+    def scene(self) -> oracles_movers.Scene:
         """For the oracles."""
-        return oracles.Scene(oracle_of(self.source), oracle_of(self.target), tuple(self.background))
+        return oracles_movers.Scene(oracle_of(self.source), oracle_of(self.target), tuple(self.background))
 
 
 def poor_batch(name: str) -> ScanPairBatch:
@@ -140,3 +141,11 @@ def survey(name: str) -> Surveyed:
         pair = pair_of(poor_batch(name), 0)
     known = survey_at(*grids_of(pair), background, pair.dt)
     return Surveyed(pair._replace(initial_motion=np.full(3, 0.125)), background, *known)
+
+
+def thinned(whole: Surveyed, most: int) -> Surveyed:
+    """The same scene by every so many beams, so that a scan has about `most` points at most."""
+    stride = -(-max(len(whole.pair.source), len(whole.pair.target)) // most)
+    source, target = (np.ascontiguousarray(points[::stride]) for points in (whole.pair.source, whole.pair.target))
+    pair = whole.pair._replace(source=source, target=target)
+    return Surveyed(pair, whole.background, *survey_at(*grids_of(pair), whole.background, pair.dt))

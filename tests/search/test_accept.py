@@ -1,7 +1,7 @@
 """Which hypotheses are accepted as movers: those that move, each once, whatever the frame; and as the oracle accepts them."""
 
 import numpy as np
-import oracles_search as oracles
+import oracles_movers as oracles
 import pytest
 import torch
 from support import assert_close

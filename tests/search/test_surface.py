@@ -4,7 +4,7 @@ import numpy as np
 import oracles_search as oracles
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from support import assert_close, make_points, normal, polar
 from surveyed import NOISE, any_scan, oracle_of, seen
@@ -251,7 +251,6 @@ def test_a_surface_equals_the_oracle(scan: Surface) -> None:
 
 @given(any_scan(), st.integers(0, 10_000))
 def test_sights_equal_the_oracle(scan: Surface, seed: int) -> None:
-    if scan.is_closed and len(scan.points) < 3:
-        return  # with one beam or two there is no closed circle to speak of
+    assume(len(scan.points) > 2 or not scan.is_closed)  # with one beam or two there is no closed circle to speak of
     places = scan.points[0] + 4 * normal(20, 2, seed=seed).numpy()
     assert verdicts(places, scan) == [oracles.sight(oracle_of(scan), place) for place in places]
