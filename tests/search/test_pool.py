@@ -4,13 +4,14 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import oracles_search as oracles
 import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from rooms_seen import STILL, right, see_room, sides
 from support import assert_close, generator, normal, polar
-from surveyed import any_scan, array, grids, seen
+from surveyed import any_scan, array, grids, oracle_of, seen
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
@@ -18,12 +19,25 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import MODEL_CARS, SimulatorConfig
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.loops.threads import in_parts
-from torchcrf_scan.search.background import background_cost, unit_length
-from torchcrf_scan.search.grid import ScanGrid, grid_of
+from torchcrf_scan.search.background import (
+    POLISH_ALONG,
+    POLISH_GATES,
+    REFINE_ALONG,
+    REFINE_GATES,
+    background_cost,
+    polish,
+    refine,
+    unit_length,
+)
+from torchcrf_scan.search.grid import LENGTH_SHARE, ScanGrid, grid_of
 from torchcrf_scan.search.pool import (
+    COARSE_ALONG,
+    COARSE_GATES,
     GRID_REACH,
     GRID_SHIFTS,
     GRID_TURNS,
+    SEGMENT_ALONG,
+    SEGMENT_GATES,
     SLIDE_STEP,
     SLIDES,
     background_pool,
@@ -122,6 +136,44 @@ def test_the_pool_is_sorted_and_holds_the_truth_first() -> None:
     assert pool.shape[1] == 3
     assert (np.diff(background_cost(array(pool), source, target, 0, 1.0)) >= 0).all()
     assert right(pool[:1], motion[None], 0.01, 0.005) == 1
+
+
+@pytest.mark.parametrize("stage", ["coarse", "segments", "polish", "refine"])
+def test_stages_are_registrations_with_gates_of_their_own(stage: str) -> None:
+    source, target = see_room(STILL, 41), see_room(torch.tensor([0.05, -0.4, 0.1]).double(), 37)
+    unit = unit_length(source.scan, target.scan)
+    here, there = oracle_of(source.scan), oracle_of(target.scan)
+    pull = np.clip(np.array(here.length) / oracles.lower_median(here.length), *LENGTH_SHARE)
+    starts = np.array([0.05, -0.4, 0.1]) + 0.05 * normal(2, 3).numpy()
+    segments = segment_points(source.scan, large_segments(source.scan))
+    found, expected = {
+        "coarse": lambda: (
+            search_coarsely(starts, source, target, unit),
+            [oracles.register(here.points, pull, there, m, unit * COARSE_GATES, COARSE_ALONG) for m in starts],
+        ),
+        "segments": lambda: (
+            segment_hypotheses(segments, target, starts, unit),
+            [oracles.register(s, np.ones(24), there, m, unit * SEGMENT_GATES, SEGMENT_ALONG) for s in segments for m in starts],
+        ),
+        "polish": lambda: (
+            polish(starts, source, target, unit),
+            [oracles.register(here.points, pull, there, m, unit * POLISH_GATES, POLISH_ALONG) for m in starts],
+        ),
+        "refine": lambda: (
+            refine(starts, source, target),
+            [oracles.register_both(here, there, m, REFINE_GATES, REFINE_ALONG) for m in starts],
+        ),
+    }[stage]()
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7)
+
+
+def test_segments_are_drawn_evenly_the_largest_first() -> None:
+    ranges = torch.tensor([4.0] * 30 + [2.0] * 7 + [6.0] * 5 + [3.0] * 50, dtype=torch.float64)
+    scan = seen(polar(ranges, torch.linspace(-0.6, 0.6, 92, dtype=torch.float64)))
+    members = [np.flatnonzero(scan.segment == number) for number in (3, 0, 1)]  # five points are too few
+    assert large_segments(scan).tolist() == [3, 0, 1]
+    drawn = [[of[k * len(of) // 24] for k in range(24)] for of in members]
+    np.testing.assert_array_equal(segment_points(scan, large_segments(scan)), scan.points[np.array(drawn)])
 
 
 # Whole scenes.
