@@ -219,19 +219,20 @@ def pairwise_clustering(
 # Extensions. A scan is (points in beam order, origin, closed, noise).
 
 
-def look(scan: tuple[Sequence[Sequence[float]], Sequence[float], bool, float], point: Sequence[float]) -> tuple[float, float]:
-    """How far a scan sees through a point and how far it hides it."""
+Scan = tuple[Sequence[Sequence[float]], Sequence[float], bool, float]
+
+
+def beams_about(scan: Scan, point: Sequence[float]) -> tuple[float, float, bool, float] | None:
+    """Nearer and farther range of the beams beside a point, whether they are close enough to tell, and the slack; None: outside."""
     points, origin, closed, noise = scan
     arms = [(p[0] - origin[0], p[1] - origin[1]) for p in points]
     ranges, bearings = [math.hypot(*arm) for arm in arms], [math.atan2(arm[1], arm[0]) for arm in arms]
     turns = [(after - before) % (2 * math.pi) for before, after in itertools.pairwise(bearings)]
     step = sorted(turns)[(len(turns) - 1) // 2] if turns else math.radians(0.5)
-    if len(points) == 0:
-        return 0.0, 0.0
     arm = (point[0] - origin[0], point[1] - origin[1])
     mine = math.hypot(*arm)
     onward = (math.atan2(arm[1], arm[0]) - bearings[0]) % (2 * math.pi)  # from the first beam
-    span = sum(turns)
+    span, is_measured = sum(turns), True
     if closed or onward < span:
         begin, beams = 0.0, [*range(len(points)), 0]
         for left, right in itertools.pairwise(beams if closed else beams[:-1]):
@@ -239,17 +240,28 @@ def look(scan: tuple[Sequence[Sequence[float]], Sequence[float], bool, float], p
             if begin <= onward <= begin + width:
                 break
             begin += width
-        if max(onward - begin, begin + width - onward) >= 2.5 * step:
-            return 0.0, 0.0
+        is_measured = max(onward - begin, begin + width - onward) < 2.5 * step
     elif min(onward - span, 2 * math.pi - onward) > step / 2:
-        return 0.0, 1.0
+        return None
     else:
         left = right = 0 if 2 * math.pi - onward < step / 2 else len(points) - 1
-    slack = max(3 * (noise + mine * step) + 0.02 * mine, 1e-6)
-    return tuple(  # type: ignore[return-value]
-        min(max(beyond / slack - 1, 0.0), 1.0)
-        for beyond in (min(ranges[left], ranges[right]) - mine, mine - max(ranges[left], ranges[right]))
-    )
+    slack = 3 * (noise + mine * step) + 0.02 * mine
+    return min(ranges[left], ranges[right]), max(ranges[left], ranges[right]), is_measured, slack
+
+
+def look(scan: Scan, point: Sequence[float]) -> tuple[float, float]:
+    """How far a scan sees through a point and how far it hides it."""
+    if len(scan[0]) == 0:
+        return 0.0, 0.0
+    about = beams_about(scan, point)
+    if about is None:
+        return 0.0, 1.0
+    near, far, is_measured, slack = about
+    if not is_measured:
+        return 0.0, 0.0
+    mine = math.dist(point, scan[1])
+    seen, hidden = (min(max(beyond / max(slack, 1e-6) - 1, 0.0), 1.0) for beyond in (near - mine, mine - far))
+    return seen, hidden
 
 
 def past_gate(distance: float, gate: float) -> float:

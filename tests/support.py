@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,8 +14,9 @@ PAPER_WEIGHTS = [*PAPER_ASSOCIATION, *(23 + k for k in PAPER_CLUSTERING)]  # of 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-9}  # relative and absolute
 
 
-def assert_close(actual: Tensor, expected: Any, *, tolerance: float | None = None) -> None:
+def assert_close(actual: Any, expected: Any, *, tolerance: float | None = None) -> None:
     """Same shape, same infinities and NaN, and values within the tolerance of `actual`'s dtype (exact for whole numbers)."""
+    actual = actual if isinstance(actual, Tensor) else torch.from_numpy(np.array(actual))
     within = TOLERANCE.get(actual.dtype, 0.0) if tolerance is None else tolerance
     comparable = actual.double() if actual.is_floating_point() else actual
     wanted = torch.as_tensor(expected, dtype=comparable.dtype)

@@ -1,24 +1,19 @@
-"""Which code answers, and that both answer alike: batches, threads, priors, scans with hardly a point."""
+"""Both engines of the rounds answer alike: batches, threads, priors, scans with hardly a point."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
 
 from torchcrf_scan import JointScanCRF, Scan, ScanPair, ScanPairBatch
-from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.fast.choice import can_decode, can_search, is_numba_installed
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.learning.material import collect
-from torchcrf_scan.learning.settings import LearningConfig
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.prediction import Prediction
 
-needs_numba = pytest.mark.skipif(not is_numba_installed(), reason="needs numba, the extra fast")
-POINTS = torch.zeros(1, 3, 2)
 SCANNER = SimulatorConfig(beams=121)
 
 
@@ -78,7 +73,6 @@ def assert_alike(found: Prediction, expected: Prediction, mask: torch.Tensor) ->
     assert torch.equal(found.uncertainty.degenerate[expected.active], expected.uncertainty.degenerate[expected.active])
 
 
-@needs_numba
 @torch.no_grad()
 def test_both_give_the_same_answer(compiled: JointScanCRF, eager: JointScanCRF, batch: ScanPairBatch) -> None:
     found, expected = compiled(batch), eager(batch)
@@ -87,7 +81,6 @@ def test_both_give_the_same_answer(compiled: JointScanCRF, eager: JointScanCRF, 
     assert not any(value.isnan().any() for value in (found.motions, found.log_association, found.association_confidence))
 
 
-@needs_numba
 @torch.no_grad()
 def test_a_batch_is_a_loop_whatever_the_threads(compiled: JointScanCRF, batch: ScanPairBatch, two_threads: None) -> None:
     together = compiled(batch)
@@ -100,21 +93,18 @@ def test_a_batch_is_a_loop_whatever_the_threads(compiled: JointScanCRF, batch: S
         assert torch.equal(alone.log_cluster[0, :n], together.log_cluster[b, :n])
 
 
-@needs_numba
 @torch.no_grad()
-def test_both_start_alike_and_go_on_from_a_given_start(compiled: JointScanCRF, eager: JointScanCRF, batch: ScanPairBatch) -> None:
+def test_both_start_from_the_same_search_and_go_on_from_a_given_start(
+    compiled: JointScanCRF, eager: JointScanCRF, batch: ScanPairBatch
+) -> None:
     found, expected = compiled.initialise(batch), eager.initialise(batch)
-    assert torch.equal(found.active, expected.active)
-    assert torch.equal(found.association, expected.association)
-    assert found.reach is not None
-    assert expected.reach is not None
-    assert torch.equal(found.reach[batch.source_mask], expected.reach[batch.source_mask])
-    assert torch.allclose(found.motions, expected.motions, atol=1e-5)
-    assert torch.allclose(found.target_tangents, expected.target_tangents)
-    assert_alike(compiled(batch, expected), eager(batch, expected), batch.source_mask)
+    for field in fields(Start):
+        assert torch.equal(getattr(found, field.name), getattr(expected, field.name)), field.name
+    one = batch.select(torch.tensor([0]))
+    given = replace(eager.initialise(one), reach=None, log_odds=None)
+    assert_alike(compiled(one, given), eager(one, given), one.source_mask)
 
 
-@needs_numba
 def test_gradients_are_asked_of_tensors(batch: ScanPairBatch) -> None:
     model = JointScanCRF.from_pretrained(motion_weights="soft", iterations=1).double()
     one = batch.select(torch.tensor([0]))
@@ -122,53 +112,31 @@ def test_gradients_are_asked_of_tensors(batch: ScanPairBatch) -> None:
     assert model.clustering_weights["sequence"].grad is not None
 
 
-@needs_numba
-def test_learning_looks_at_pairs_with_either() -> None:
-    pairs = simulate_pairs(SCANNER, 2, 2, 71)
-    config = LearningConfig(disturbance=0.0)
-    found, expected = (collect(pairs, config, backend=backend) for backend in ("compiled", "eager"))
-    for one, other in zip(found.surveys, expected.surveys, strict=True):
-        assert one is not None
-        assert other is not None
-        assert torch.allclose(one.background, other.background, atol=1e-4)
-        assert torch.equal(one.hypotheses.members, other.hypotheses.members)
-        assert torch.allclose(one.features, other.features, atol=2e-2)
-
-
-@needs_numba
+@pytest.mark.parametrize("empty", [(0, 9), (9, 0), (0, 0)])
 @torch.no_grad()
-def test_an_empty_scan_is_left_to_tensors(compiled: JointScanCRF, pairs: list[ScanPair]) -> None:
-    batch = ScanPairBatch.collate([pairs[0], ScanPair(tiny_scan(0), tiny_scan(9))], torch.float64)
-    prediction = compiled(batch)
-    assert (prediction.association[1] == -1).all()
-    assert prediction.motions.isfinite().all()
-
-
-@pytest.mark.parametrize(
-    ("config", "reason"),
-    [
-        (ModelConfig(inference=InferenceConfig(schedule="flooding", backend="compiled")), "schedule: flooding"),
-        (ModelConfig(inference=InferenceConfig(temperature=1.0, backend="compiled")), "temperature: 1.0"),
-        (ModelConfig(coupling="lattice", inference=InferenceConfig(backend="compiled")), "coupling: lattice"),
-        (ModelConfig(chains="matching", inference=InferenceConfig(backend="compiled")), "chains: matching"),
-    ],
-)
-def test_what_is_not_compiled_is_said(config: ModelConfig, reason: str) -> None:
-    with pytest.raises(ValueError, match=f"backend: expected for compiled .*{reason}"):
-        can_decode(config, POINTS, needs_gradient=False)
-    automatic = replace(config, inference=replace(config.inference, backend="auto"))
-    assert not can_decode(automatic, POINTS, needs_gradient=False)
-
-
-def test_without_numba_tensors_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchcrf_scan.fast.choice.is_numba_installed", lambda: False)
-    assert not can_search("auto", POINTS)
-    assert not can_decode(ModelConfig(), POINTS, needs_gradient=False)
-    with pytest.raises(ValueError, match="backend: expected for compiled numba"):
-        can_search("compiled", POINTS)
-
-
-def test_a_gradient_needs_tensors() -> None:
-    assert not can_decode(ModelConfig(), POINTS, needs_gradient=True)
-    with pytest.raises(ValueError, match="no gradient"):
-        can_decode(ModelConfig(inference=InferenceConfig(backend="compiled")), POINTS, needs_gradient=True)
+def test_an_empty_scan_is_answered_and_changes_no_other_answer(
+    compiled: JointScanCRF, pairs: list[ScanPair], empty: tuple[int, int]
+) -> None:
+    nothing = ScanPair(*(tiny_scan(points) for points in empty))
+    alone = ScanPairBatch.collate(pairs[:2], torch.float64)
+    expected, found = compiled(alone), compiled(ScanPairBatch.collate([pairs[0], nothing, pairs[1]], torch.float64))
+    for b, k in ((0, 0), (1, 2)):
+        n = int(alone.source_mask[b].sum())
+        for name in ("association", "cluster"):
+            assert torch.equal(getattr(found, name)[k, :n], getattr(expected, name)[b, :n]), name
+        assert torch.equal(found.motions[k], expected.motions[b])
+        assert torch.equal(found.log_cluster[k, :n], expected.log_cluster[b, :n])
+    assert (found.association[1] == -1).all()
+    assert (found.cluster[1] == -1).all()
+    assert found.active[1].tolist() == [True] + [False] * (found.active.shape[1] - 1)
+    assert found.uncertainty is not None
+    assert found.association_confidence is not None
+    assert found.cluster_confidence is not None
+    confidences = found.association_confidence[1], found.cluster_confidence[1]
+    for values in (found.motions[1], found.uncertainty.covariance[1], found.uncertainty.information[1], *confidences):
+        assert values.isfinite().all()
+    for log in (found.log_association[1], found.log_cluster[1]):
+        assert torch.allclose(log.exp().sum(-1), torch.ones_like(log[:, 0]))
+    by_beam = compiled.match_pairs([pairs[0], nothing, pairs[1]])[1]
+    assert by_beam.association.tolist() == [-1] * 9
+    assert np.isfinite(by_beam.motions).all()

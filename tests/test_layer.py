@@ -13,7 +13,6 @@ from torch import Tensor
 
 from torchcrf_scan import ClusteringCRF, ExtraLogUnary, FeatureConfig, InferenceConfig, JointScanCRF, MatchingCRF, ModelConfig
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.fast.choice import is_numba_installed
 from torchcrf_scan.features.learned import Embeddings
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.selection import evidence
@@ -324,7 +323,6 @@ def test_where_compiled_code_would_answer_tensors_do() -> None:
         )
 
 
-@pytest.mark.skipif(not is_numba_installed(), reason="needs numba, the extra fast")
 @torch.no_grad()
 def test_compiled_code_takes_log_potentials() -> None:
     batch, start = scene()

@@ -13,7 +13,6 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.encoder.aligned import aligned_inputs
 from torchcrf_scan.encoder.channels import CHANNELS, FARTHEST
-from torchcrf_scan.fast.choice import is_numba_installed
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start
 
@@ -43,7 +42,6 @@ def scan_of(points: int) -> Scan:
     return Scan.from_ranges(np.where(np.arange(9) < points, 4.0, np.inf), np.linspace(-0.5, 0.5, 9))
 
 
-@pytest.mark.skipif(not is_numba_installed(), reason="needs numba, the extra fast")
 @pytest.mark.parametrize("world", ["street", "model_cars"])
 def test_compiled_code_sees_the_same(world: str) -> None:
     batch = simulated(world)
@@ -55,9 +53,7 @@ def test_compiled_code_sees_the_same(world: str) -> None:
     assert len(aligned_inputs(batch, started(batch), "compiled", both=False)) == 1
 
 
-@pytest.mark.parametrize(
-    "backend", ["eager", pytest.param("auto", marks=pytest.mark.skipif(not is_numba_installed(), reason="numba"))]
-)
+@pytest.mark.parametrize("backend", ["eager", "auto"])
 def test_scans_with_hardly_a_point(backend: str) -> None:
     pairs = [ScanPair(scan_of(n), scan_of(m)) for n, m in ((0, 0), (0, 5), (1, 0), (1, 1), (2, 9))]
     batch = ScanPairBatch.collate(pairs, torch.float64)

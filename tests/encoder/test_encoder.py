@@ -14,7 +14,6 @@ from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.encoder.encoder import ScanEncoder, unroll
 from torchcrf_scan.experiment.methods import with_config
 from torchcrf_scan.export import UnrolledDecoder, decoder_inputs
-from torchcrf_scan.fast.choice import is_numba_installed
 from torchcrf_scan.features.learned import ExtraLogUnary
 from torchcrf_scan.learning.checkpoint import load_weights
 from torchcrf_scan.learning.objectives import make_objective
@@ -84,9 +83,7 @@ def test_padding_is_invisible() -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(
-    "backend", ["eager", pytest.param("auto", marks=pytest.mark.skipif(not is_numba_installed(), reason="numba"))]
-)
+@pytest.mark.parametrize("backend", ["eager", "auto"])
 def test_before_it_has_learned_it_says_nothing(batch: ScanPairBatch, backend: str) -> None:
     expected, found = JointScanCRF.from_pretrained(backend=backend)(batch), with_encoder(backend=backend)(batch)
     assert torch.equal(found.association, expected.association)
@@ -110,7 +107,6 @@ def test_what_it_says_is_what_could_have_been_given(batch: ScanPairBatch) -> Non
 
 
 @torch.no_grad()
-@pytest.mark.skipif(not is_numba_installed(), reason="needs numba, the extra fast")
 def test_compiled_code_listens_to_it(batch: ScanPairBatch) -> None:
     found, expected = (loud(with_encoder(backend=backend)).double()(batch.to(torch.float64)) for backend in ("compiled", "eager"))
     assert torch.equal(found.association, expected.association.masked_fill(~batch.source_mask, -1))

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import all_real, assert_close, generator, make_points, pad, polar
 from torch import Tensor
-from torchcrf_scan.inference.surface import Surface, look_along
 
 from torchcrf_scan.features.free_space import FreeSpace, Sweep, look
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.search.surface import OCCLUDED, SEEN_THROUGH, look_along, surface_of
 
 SEEDS = st.integers(0, 10_000)
 ANGLES = st.floats(-math.pi, math.pi)
@@ -176,9 +176,10 @@ def test_it_says_yes_where_the_flags_of_the_start_do(scan: tuple[int, bool, floa
     points, origin = make_scan(n, turn, seed, closed=closed)
     asked = queries(points, origin, seed)
     found = look(sweep(points, closed=closed, noise=noise, origin=origin), asked[None])
-    flags = look_along(asked, Surface.of(points, torch.tensor(noise, dtype=torch.float64), closed, origin))
-    assert torch.equal(found.seen_through[0] > 0, flags.seen_through)
-    assert torch.equal(found.hidden[0] > 0, flags.occluded)
+    surface = surface_of(points.contiguous().numpy(), noise, closed, origin.numpy())
+    flags = [look_along(surface, x, y) for x, y in asked.tolist()]
+    assert (found.seen_through[0] > 0).tolist() == [flag == SEEN_THROUGH for flag in flags]
+    assert (found.hidden[0] > 0).tolist() == [flag == OCCLUDED for flag in flags]
 
 
 @given(ANGLES, SEEDS)

@@ -3,11 +3,11 @@
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
 
+import numpy as np
 import pytest
 import torch
 from support import assert_close
 from torch import Tensor
-from torchcrf_scan.inference.initialise import initialise
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.experiment.study import Study
@@ -15,15 +15,19 @@ from torchcrf_scan.learning import material as material_module
 from torchcrf_scan.learning.material import Collection, assign_folds, collect
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.search.accept import score_of
+from torchcrf_scan.search.pairs import initialise
 from torchcrf_scan.search.score import HypothesisScore
 
 UNDISTURBED = LearningConfig(disturbance=0.0, folds=2, batch_size=2)
 
 
 def tensors(value: object) -> Iterator[Tensor]:
-    """Every tensor in nested dataclasses and sequences."""
+    """Every tensor and array in nested dataclasses and sequences."""
     if isinstance(value, Tensor):
         yield value
+    elif isinstance(value, (np.ndarray, bool, float)):
+        yield torch.from_numpy(np.array(value))
     elif isinstance(value, (list, tuple)):
         for part in value:
             yield from tensors(part)
@@ -101,7 +105,7 @@ def test_material_is_the_chosen_pairs_with_the_start_of_the_score(small_pairs: l
     assert seen == sorted(round(float(ScanPairBatch.collate([pairs[k]]).source.sum()), 3) for k in (2, 0))
     for part in material:
         assert torch.equal(ScanPairBatch.collate(part.pairs).source, part.batch.source)
-        expected = initialise(part.batch, score, 4)
+        expected = initialise(part.batch, score_of(score), 4)
         assert part.start.motions.shape == (len(part.batch), 4, 3)
         assert torch.equal(part.start.active, expected.active)
         assert_close(part.start.motions, expected.motions, tolerance=1e-4)

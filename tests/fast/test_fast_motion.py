@@ -1,0 +1,74 @@
+"""Motions of hard labels, against the eager functions."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from support import generator, make_points, normal
+from torch import Tensor
+
+from torchcrf_scan.fast import motion
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference import motion as eager
+
+SCALE, MIN_EXTENT, C = 0.2, 0.1, 4
+HERE = torch.tensor([1.0, 2.0], dtype=torch.float64)
+CLOUDS: dict[str, Callable[[int], Tensor]] = {
+    "spread": lambda n: make_points(n, 3),
+    "identical": lambda n: HERE.expand(n, 2).clone(),
+    "collinear": lambda n: HERE + torch.arange(n, dtype=torch.float64)[:, None] * HERE.flip(0) / 4,
+}
+
+
+def array(values: Tensor) -> Any:
+    return np.ascontiguousarray(values.numpy())
+
+
+@pytest.mark.parametrize("metric", ["point", "line", "given"])
+@pytest.mark.parametrize("cloud", CLOUDS)
+@pytest.mark.parametrize(("n", "m"), [(40, 30), (1, 1), (2, 3), (3, 3), (9, 4)])
+def test_motions_agree_with_the_eager_ones(metric: str, cloud: str, n: int, m: int) -> None:
+    source, target = CLOUDS[cloud](n), CLOUDS[cloud](m)
+    tangents = torch.nn.functional.normalize(normal(m, 2, seed=9), dim=-1)
+    tangents[0] = 0
+    for seed in range(4):
+        association = torch.randint(-1, m, (n,), generator=generator(seed))
+        cluster = torch.randint(-1, C - 1, (n,), generator=generator(seed + 9))  # the last one has no points
+        start = eager.Motions.start(normal(1, C, 3, seed=seed), torch.tensor([[True, True, seed % 2 == 0, True]]))
+        support = eager.hard_support(source[None], target[None], tangents[None], association[None], cluster[None], C)
+        expected = start.value
+        if metric != "given":
+            scale = torch.tensor(SCALE, dtype=torch.float64)
+            expected = eager.estimate(source[None], support, start, metric=metric, scale=scale, min_extent=MIN_EXTENT).value
+        labels, motions, active = (array(association), array(cluster)), array(start.value[0]), array(start.active[0])
+        scans = array(source), array(target), array(tangents)
+        found = motion.estimate(*scans, *labels, motions, active, motion.METRICS.index(metric), SCALE, MIN_EXTENT)
+        difference = found - expected[0].numpy()
+        difference[:, 0] = se2.wrap(difference[:, 0])  # half a turn is one either way
+        np.testing.assert_allclose(difference, 0, atol=1e-9)
+        np.testing.assert_array_equal(motions, start.value[0])
+        count = motion.count_points(*labels, C)
+        np.testing.assert_array_equal(count, support.count[0])
+        empty_for = np.zeros(C, np.int64)
+        for _ in range(3):
+            motion.retire_empty(active, empty_for, count)
+            start = eager.retire_empty(start, support.count)
+            np.testing.assert_array_equal(active, start.active[0])
+            np.testing.assert_array_equal(empty_for, start.empty_for[0])
+
+
+def test_no_points_leave_the_motions() -> None:
+    nobody, motions = np.full(5, -1), array(normal(C, 3))
+    scans = array(make_points(5)), array(make_points(4)), np.zeros((4, 2))
+    found = motion.estimate(*scans, nobody, nobody, motions, np.ones(C, np.bool_), motion.LINE, SCALE, MIN_EXTENT)
+    np.testing.assert_array_equal(found, motions)
+
+
+def test_small_systems_are_solved() -> None:
+    root = normal(3, 3).numpy()
+    a = root @ root.T + np.eye(3)
+    b = normal(3, seed=1).numpy()
+    found = motion.solve(a[0, 0], a[0, 1], a[0, 2], a[1, 1], a[1, 2], a[2, 2], *b)
+    np.testing.assert_allclose(found, np.linalg.solve(a, b))
