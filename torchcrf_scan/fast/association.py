@@ -12,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcrf_scan.fast.boosting import Stumps, add_margins, double_array, margin, stumps_of
+from torchcrf_scan.fast.robust import robust_square
 from torchcrf_scan.features.extension import FARTHEST_EXCESS
 from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, GATE_WIDTH, KAPPA, LOCAL_CHANNELS, SHAPE_CHANNELS, STATIC_CHANNELS
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.messages import exp_below, log_softmax, max_marginals
-from torchcrf_scan.loops.rigid import apply
+from torchcrf_scan.loops.rigid import apply, transform, transform_of
 from torchcrf_scan.loops.shape import Shape
 
 REGISTERED, RADIUS = STATIC_CHANNELS, SHAPE_CHANNELS
@@ -122,13 +123,6 @@ def _packed(shape: Shape, points: Array) -> Array:
 def association_pair(source: Array, target: Array, of_source: Shape, of_target: Shape, initial_motion: Array) -> AssociationPair:
     """source: (N, 2), target: (M, 2) and their shapes, in the unit of the features; initial_motion: (3,)."""
     return AssociationPair(source, target, _packed(of_source, apply(initial_motion, source)), _packed(of_target, target))
-
-
-@kernel
-def robust_square(error: float, per_scale: float) -> float:
-    """Minus min((error per_scale)^2, kappa). per_scale: one over the scale."""
-    ratio = error * per_scale
-    return -min(ratio * ratio, KAPPA)
 
 
 @kernel
@@ -470,14 +464,12 @@ def registered_points(source: Array, motions: Array, active: Booleans, log_clust
 
     source: (N, 2); motions: (C, 3); active: (C,); log_cluster: (N, D), the outlier last.
     """
-    C = len(active)
-    moved, cos, sin = np.empty_like(source), np.cos(motions[:, 0]), np.sin(motions[:, 0])
+    C, moved = len(active), np.empty_like(source)
+    transforms = [transform_of(motions[c]) for c in range(C)]
     for i in range(len(source)):
         best, largest = 0, -np.inf
         for c in range(C):
             if active[c] and log_cluster[i, c] > largest:
                 best, largest = c, log_cluster[i, c]
-        x, y = source[i, 0], source[i, 1]
-        moved[i, 0] = cos[best] * x - sin[best] * y + motions[best, 1]
-        moved[i, 1] = sin[best] * x + cos[best] * y + motions[best, 2]
+        moved[i, 0], moved[i, 1] = transform(transforms[best], source[i, 0], source[i, 1])
     return moved

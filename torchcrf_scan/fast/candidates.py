@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.nearest import RUN, Boxes, box_distance, nearest
+from torchcrf_scan.loops.rigid import apply
 
 
 @kernel
@@ -20,12 +19,7 @@ def under_motions(source: Array, motions: Array, active: Booleans) -> tuple[Arra
             A += 1
     moved = np.empty((A, len(source), 2))
     for a in range(A):
-        motion = motions[which[a]]
-        cos, sin = math.cos(motion[0]), math.sin(motion[0])
-        for i in range(len(source)):
-            x, y = source[i, 0], source[i, 1]
-            moved[a, i, 0] = cos * x - sin * y + motion[1]
-            moved[a, i, 1] = sin * x + cos * y + motion[2]
+        moved[a] = apply(motions[which[a]], source)
     return moved, which[:A]
 
 

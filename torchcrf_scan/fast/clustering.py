@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from torchcrf_scan.fast.free_space import Sweep, look
-from torchcrf_scan.features.scales import CLUSTERING_WEIGHTS, GATE_WIDTH, KAPPA
+from torchcrf_scan.fast.robust import robust_square
+from torchcrf_scan.features.scales import CLUSTERING_WEIGHTS, GATE_WIDTH
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.messages import max_marginals
 from torchcrf_scan.loops.nearest import Boxes, nearest
-from torchcrf_scan.loops.rigid import inverse
+from torchcrf_scan.loops.rigid import inverse, transform, transform_of
 
 if TYPE_CHECKING:
     from torchcrf_scan.inference.state import Parameters
@@ -93,12 +94,6 @@ class Tables(NamedTuple):
 
 
 @kernel
-def capped_square(error: float, scale: float) -> float:
-    """`features.scales.robust_square`."""
-    return -min((error / scale) ** 2, KAPPA)
-
-
-@kernel
 def distance(dx: float, dy: float) -> float:
     """Length of a vector; `hypot` guards against overflow, which takes several times as long."""
     return math.sqrt(dx * dx + dy * dy)
@@ -115,12 +110,10 @@ def nearest_to_outliers(boxes: Boxes, source: Array, motions: Array, active: Boo
     for c in range(len(motions)):
         if not active[c]:
             continue
-        cos, sin = math.cos(motions[c, 0]), math.sin(motions[c, 0])
-        guess = 0
+        by, guess = transform_of(motions[c]), 0
         for i in range(len(source)):
             if association[i] < 0:
-                x = cos * source[i, 0] - sin * source[i, 1] + motions[c, 1]
-                y = sin * source[i, 0] + cos * source[i, 1] + motions[c, 2]
+                x, y = transform(by, source[i, 0], source[i, 1])
                 guess = nearest(boxes, x, y, guess)[1]
                 index[i, c] = guess
     return index
@@ -142,7 +135,7 @@ def edge_potentials(source: Array, target: Array, association: Integers, model: 
             stretch = distance(target[b, 0] - target[a, 0], target[b, 1] - target[a, 1]) - length[i]
             stiff = math.exp(-((stretch / model.neighbour_distance) ** 2))
             same[i] += w.neighbour_stiffness_same * stiff
-            same[i] += w.neighbour_distance_same * capped_square(stretch, model.neighbour_distance)
+            same[i] += w.neighbour_distance_same * robust_square(stretch, 1 / model.neighbour_distance)
             different[i] += w.neighbour_stiffness_different * (1 - stiff)
     return length, same, different
 
@@ -159,10 +152,9 @@ def fill_residual(
     residual: Array,
 ) -> None:
     """`moved` (N, 2) and `residual` (N,) of cluster c at its motion (3,). Other arguments as in `tabulate`."""
-    cos, sin = math.cos(motion[0]), math.sin(motion[0])
+    by = transform_of(motion)
     for i in range(len(source)):
-        x = cos * source[i, 0] - sin * source[i, 1] + motion[1]
-        y = sin * source[i, 0] + cos * source[i, 1] + motion[2]
+        x, y = transform(by, source[i, 0], source[i, 1])
         j = association[i] if association[i] >= 0 else nearest_target[i, c]
         moved[i, 0], moved[i, 1], residual[i] = x, y, distance(x - target[j, 0], y - target[j, 1])
 
@@ -177,7 +169,7 @@ def fill_agreement(
         if not reach[i, c]:
             log_inlier[i] = -np.inf
             continue
-        total = w.cluster_distance * capped_square(residual[i], model.cluster_distance)
+        total = w.cluster_distance * robust_square(residual[i], 1 / model.cluster_distance)
         if w.gate != 0:
             total -= w.gate / (1 + math.exp(-(residual[i] / model.gate - 1) / GATE_WIDTH))
         log_inlier[i] = total + (w.cluster_inlier_in if association[i] >= 0 else 0.0)
@@ -209,13 +201,11 @@ def subtract_back(
     w = model.weights
     if w.seen_through_back == 0 and w.hidden_back == 0:
         return
-    back = inverse(motion)
-    cos, sin = math.cos(back[0]), math.sin(back[0])
+    by = transform_of(inverse(motion))
     for i in range(len(association)):
         j = association[i]
         if j >= 0 and log_inlier[i] > -np.inf:
-            x = cos * target[j, 0] - sin * target[j, 1] + back[1]
-            y = sin * target[j, 0] + cos * target[j, 1] + back[2]
+            x, y = transform(by, target[j, 0], target[j, 1])
             seen_through, hidden = look(sweep, x, y)
             log_inlier[i] -= w.seen_through_back * seen_through + w.hidden_back * hidden
 
@@ -287,7 +277,7 @@ def transition_potentials(tables: Tables, states: Integers, log_unary: Array, mo
                 if s != t and is_possible and log_unary[i + 1, t] > -np.inf:
                     k = states[t]
                     across = distance(tables.moved[k, i + 1, 0] - x, tables.moved[k, i + 1, 1] - y)
-                    parting = capped_square(across - tables.length[i], model.neighbour_distance)
+                    parting = robust_square(across - tables.length[i], 1 / model.neighbour_distance)
                     edge[s, t] += w.neighbour_distance_different * parting
             edge[s, P] = edge[P, s] = w.pairwise_outlier
         edge[P, P] = w.sequence

@@ -35,7 +35,7 @@ from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.nearest import Boxes, boxes_of
 from torchcrf_scan.loops.pair import Pair, PairStart
-from torchcrf_scan.loops.rigid import wrap
+from torchcrf_scan.loops.rigid import parting, transform_of, wrap
 from torchcrf_scan.loops.shape import describe, resolution
 
 
@@ -361,14 +361,11 @@ def has_settled(after: State, before: State, settings: Settings) -> bool:
 @kernel
 def mean_gap(source: Array, a: Array, b: Array, labels: Integers, c: int) -> float:
     """How far two motions (3,) take the points with label c apart, on average. source: (N, 2); labels: (N,)."""
-    ca, sa, cb, sb = math.cos(a[0]), math.sin(a[0]), math.cos(b[0]), math.sin(b[0])
+    one, other = transform_of(a), transform_of(b)
     total, count = 0.0, 0
     for i in range(len(labels)):
         if labels[i] == c:
-            x, y = source[i, 0], source[i, 1]
-            dx = (ca - cb) * x - (sa - sb) * y + a[1] - b[1]
-            dy = (sa - sb) * x + (ca - cb) * y + a[2] - b[2]
-            total, count = total + math.sqrt(dx * dx + dy * dy), count + 1
+            total, count = total + parting(one, other, source[i, 0], source[i, 1]), count + 1
     return total / max(count, 1)
 
 

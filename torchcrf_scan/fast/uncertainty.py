@@ -8,11 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcrf_scan.fast.motion import POINT, Members, members_of, places_of
+from torchcrf_scan.fast.robust import robust_weight
 from torchcrf_scan.inference.uncertainty import MOST_CERTAIN, NEIGHBOURS, NOTHING, RUN, STEPS, STRETCH, TINY, WITHIN
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.rigid import rotate, transform, transform_of
+from torchcrf_scan.loops.solve import axes_of, inverse_of, product
 from torchcrf_scan.prediction import LEAST_SHARE
 
-SWEEPS = 30  # of Jacobi's method, more than it ever takes
 EXCLUDED = math.exp(2 * MOST_CERTAIN)  # what a state counts in the sum that it is left out of
 
 
@@ -29,82 +31,6 @@ class Fit(NamedTuple):
     freedom: Array
     centre: Array
     length: float
-
-
-@kernel
-def inverse_of(matrix: Array) -> Array:
-    """(3, 3) inverse by elimination with pivots."""
-    left, right = matrix.copy(), np.eye(3)
-    for k in range(3):
-        pivot = k
-        for r in range(k + 1, 3):
-            if abs(left[r, k]) > abs(left[pivot, k]):
-                pivot = r
-        for d in range(3):
-            left[k, d], left[pivot, d] = left[pivot, d], left[k, d]
-            right[k, d], right[pivot, d] = right[pivot, d], right[k, d]
-        share = 1 / left[k, k]
-        for d in range(3):
-            left[k, d], right[k, d] = left[k, d] * share, right[k, d] * share
-        for r in range(3):
-            factor = left[r, k]
-            if r != k and factor != 0:
-                for d in range(3):
-                    left[r, d] -= factor * left[k, d]
-                    right[r, d] -= factor * right[k, d]
-    return right
-
-
-@kernel
-def product(a: Array, b: Array) -> Array:
-    """(3, 3) of two such."""
-    found = np.zeros((3, 3))
-    for r in range(3):
-        for d in range(3):
-            found[r, d] = a[r, 0] * b[0, d] + a[r, 1] * b[1, d] + a[r, 2] * b[2, d]
-    return found
-
-
-@kernel
-def turn_away(matrix: Array, vectors: Array, p: int, q: int) -> None:
-    """One of Jacobi's rotations, in place, after which matrix[p, q] is 0. matrix: (3, 3) symmetric; vectors: (3, 3), rows."""
-    if matrix[p, q] == 0:
-        return
-    tilt = (matrix[q, q] - matrix[p, p]) / (2 * matrix[p, q])
-    t = (1.0 if tilt >= 0 else -1.0) / (abs(tilt) + math.sqrt(tilt * tilt + 1))
-    c = 1 / math.sqrt(t * t + 1)
-    s = t * c
-    r = 3 - p - q
-    matrix[p, p] -= t * matrix[p, q]
-    matrix[q, q] += t * matrix[p, q]
-    a, b = matrix[r, p], matrix[r, q]
-    matrix[r, p] = matrix[p, r] = c * a - s * b
-    matrix[r, q] = matrix[q, r] = s * a + c * b
-    matrix[p, q] = matrix[q, p] = 0.0
-    for d in range(3):
-        a, b = vectors[p, d], vectors[q, d]
-        vectors[p, d], vectors[q, d] = c * a - s * b, s * a + c * b
-
-
-@kernel
-def axes_of(symmetric: Array) -> tuple[Array, Array]:
-    """(3,) eigenvalues, ascending, and (3, 3) unit eigenvectors, a row each. symmetric: (3, 3)."""
-    matrix, vectors = symmetric.copy(), np.eye(3)
-    for _ in range(SWEEPS):
-        aside = abs(matrix[0, 1]) + abs(matrix[0, 2]) + abs(matrix[1, 2])
-        if aside <= 1e-18 * (abs(matrix[0, 0]) + abs(matrix[1, 1]) + abs(matrix[2, 2])):
-            break
-        for r in range(3):
-            turn_away(matrix, vectors, r, (r + 1) % 3)
-    values = np.empty(3)
-    for k in range(3):
-        values[k] = matrix[k, k]
-    for k in (0, 1, 0):  # sorts three
-        if values[k] > values[k + 1]:
-            values[k], values[k + 1] = values[k + 1], values[k]
-            for d in range(3):
-                vectors[k, d], vectors[k + 1, d] = vectors[k + 1, d], vectors[k, d]
-    return values, vectors
 
 
 @kernel
@@ -152,15 +78,14 @@ def linearise(
 ) -> Fit:
     """A cluster's fit at its motion. tangent, is_found: of all source points, as `surface_tangents` gives them."""
     P = len(places)
-    cos, sin = math.cos(motion[0]), math.sin(motion[0])
+    by = transform_of(motion)
     weights, residual, arm, centre = np.ones(P), np.empty((P, 2)), np.empty((P, 2)), np.zeros(2)
     total = 0.0
     for p in range(P):
-        x, y = members.points[p, 0], members.points[p, 1]
-        arm[p, 0], arm[p, 1] = cos * x - sin * y + motion[1], sin * x + cos * y + motion[2]
+        arm[p, 0], arm[p, 1] = transform(by, members.points[p, 0], members.points[p, 1])
         residual[p, 0], residual[p, 1] = arm[p, 0] - members.partner[p, 0], arm[p, 1] - members.partner[p, 1]
         if metric != POINT:
-            weights[p] = 1 / (1 + (residual[p, 0] ** 2 + residual[p, 1] ** 2) / scale**2)
+            weights[p] = robust_weight(residual[p, 0] ** 2 + residual[p, 1] ** 2, scale)
         total += weights[p]
         centre[0] += weights[p] * arm[p, 0]
         centre[1] += weights[p] * arm[p, 1]
@@ -177,8 +102,7 @@ def linearise(
         if metric != POINT:
             ux, uy = members.tangent[p, 0], members.tangent[p, 1]
             if is_found[places[p]] and (ux != 0 or uy != 0):
-                tx, ty = tangent[places[p], 0], tangent[places[p], 1]
-                ux, uy = cos * tx - sin * ty, sin * tx + cos * ty
+                ux, uy = rotate(by, tangent[places[p], 0], tangent[places[p], 1])
         lx, ly = -arm[p, 1] / length, arm[p, 0] / length
         along = ux * lx + uy * ly
         jacobian[p, 0, 0], jacobian[p, 1, 0] = lx - ux * along, ly - uy * along

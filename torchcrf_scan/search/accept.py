@@ -9,6 +9,7 @@ import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.nearest import RUN, Boxes
+from torchcrf_scan.loops.rigid import apply_to_some
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.hypotheses import Hypotheses
 from torchcrf_scan.search.hypothesis_features import share_in_common
@@ -16,7 +17,6 @@ from torchcrf_scan.search.landing import (
     EXPLAINED,
     Sample,
     box_of,
-    carry_members,
     empty_sample,
     gap_squared,
     land,
@@ -158,7 +158,7 @@ def _has_rival(
 def _residual(source: Array, target: ScanGrid, units: Array, motion: Array, index: Integers) -> float:
     """Sum of the residuals of source points (L,) under a motion (3,)."""
     moved, residual, near = np.empty((2, len(index))), np.empty(len(index)), np.empty(len(index), np.int64)
-    carry_members(source, motion, index, moved)
+    apply_to_some(motion, source, index, moved)
     residual_at(moved, target, units, residual, near)
     return float(residual.sum())
 

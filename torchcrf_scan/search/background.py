@@ -8,9 +8,9 @@ import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.median import lower_median
-from torchcrf_scan.loops.rigid import inverse
+from torchcrf_scan.loops.rigid import apply_to_rows, inverse, parting, transform_of
 from torchcrf_scan.search.grid import COST_SHARE, ScanGrid, share_of
-from torchcrf_scan.search.registration import carry, register, register_both, surface_residual
+from torchcrf_scan.search.registration import register, register_both, surface_residual
 from torchcrf_scan.search.surface import OCCLUDED, SEEN_THROUGH, UNMEASURED, Surface, bearing_of, look_between
 
 TRUNCATION = 3.0  # a residual of three units is as bad as any
@@ -72,7 +72,7 @@ def _one_way(motion: Array, points: Array, share: Array, other: ScanGrid, slack:
 
     moved: (3, P) and index: (P,) are scratch space.
     """
-    carry(motion, points, moved)
+    apply_to_rows(motion, points, moved)
     squared = moved[2]
     surface_residual(moved, other, squared, index)
     limit = (TRUNCATION * slack) ** 2
@@ -131,13 +131,10 @@ def refine(motions: Array, source: ScanGrid, target: ScanGrid) -> Array:
 
 @kernel
 def _median_gap(points: Array, one: Array, other: Array) -> float:
-    """How far apart two motions (3,) carry points (P, 2): the lower median, metres."""
-    here, there, gap = np.empty((2, len(points))), np.empty((2, len(points))), np.empty(len(points))
-    carry(one, points, here)
-    carry(other, points, there)
+    """Lower median over points (P, 2) of the distance between their places under two motions (3,), metres."""
+    a, b, gap = transform_of(one), transform_of(other), np.empty(len(points))
     for i in range(len(points)):
-        dx, dy = here[0, i] - there[0, i], here[1, i] - there[1, i]
-        gap[i] = math.sqrt(dx * dx + dy * dy)
+        gap[i] = parting(a, b, points[i, 0], points[i, 1])
     return lower_median(gap)
 
 

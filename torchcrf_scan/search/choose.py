@@ -10,11 +10,11 @@ from torchcrf_scan.inference.start import ASSOCIATION_GATE, FOOTPRINT, REACH_EXT
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.nearest import box_distance
 from torchcrf_scan.loops.pair import PairStart
+from torchcrf_scan.loops.rigid import apply_to_rows
 from torchcrf_scan.search.accept import Score, box_round, probabilities_of, select
 from torchcrf_scan.search.grid import ScanGrid, locate
 from torchcrf_scan.search.hypotheses import Hypotheses
 from torchcrf_scan.search.leftover import Leftover
-from torchcrf_scan.search.registration import carry
 
 CONSIDERED = 0.1  # probability from which a mover is considered; the score alone accepts from its own threshold
 FEWEST_POINTS = 3  # a scan with fewer says nothing of the motion
@@ -82,7 +82,7 @@ def _associate(source: Array, target: ScanGrid, motions: Array, active: Booleans
     for c in range(len(motions)):
         if not active[c]:
             continue
-        carry(motions[c], source, moved)
+        apply_to_rows(motions[c], source, moved)
         locate(moved, target, squared, near)
         for i in range(N):
             if reach[i, c] and squared[i] < least[i]:

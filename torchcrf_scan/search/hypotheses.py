@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops import rigid as geometry
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.nearest import Boxes, nearest_within
+from torchcrf_scan.loops.rigid import apply, compose, motion_onto, wrap
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.groups import MIN_POINTS, Groups, ends, groups_of
 from torchcrf_scan.search.leftover import TRUNCATION, Leftover
@@ -213,7 +213,7 @@ def _settle(
     motions, gates = np.empty((len(shift), 3)), unit * SETTLE_GATES
     points, weights = np.empty((REGISTER_POINTS, 2)), np.ones(REGISTER_POINTS)
     for h in range(len(shift)):
-        motions[h, 0] = geometry.wrap(background[0])
+        motions[h, 0] = wrap(background[0])
         motions[h, 1], motions[h, 2] = background[1] + shift[h, 0], background[2] + shift[h, 1]
     h = 0
     while h < len(shift):
@@ -235,15 +235,12 @@ def _steady(motion: Array, points: Array, heading: float, unit: float) -> Array:
     Args:
         motion: (3,). points: (L, 2). unit: metres, the error of a point.
     """
-    moved = geometry.apply(motion, points)
+    moved = apply(motion, points)
     L = len(moved)
     x = y = told = 0.0
     for i in range(L):
         x, y = x + moved[i, 0] / L, y + moved[i, 1] / L
     for i in range(L):
         told += (moved[i, 0] - x) ** 2 + (moved[i, 1] - y) ** 2
-    turn = -geometry.wrap(motion[0] - heading) / (1 + told / unit**2 * USUAL_TURN**2)
-    cos, sin = math.cos(turn), math.sin(turn)
-    back = np.empty(3)
-    back[0], back[1], back[2] = turn, x - (cos * x - sin * y), y - (sin * x + cos * y)
-    return geometry.compose(back, motion)
+    turn = -wrap(motion[0] - heading) / (1 + told / unit**2 * USUAL_TURN**2)
+    return compose(motion_onto(turn, x, y, x, y), motion)

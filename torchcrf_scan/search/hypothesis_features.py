@@ -11,7 +11,7 @@ import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.median import lower_median
-from torchcrf_scan.loops.rigid import wrap
+from torchcrf_scan.loops.rigid import rotate_back, transform_of, wrap
 from torchcrf_scan.search.feature_points import (
     AT,
     PIECE_SIZE,
@@ -64,7 +64,7 @@ def hypothesis_features(leftover: Leftover, hypotheses: Hypotheses) -> Array:
             row[:] = features[h - 1]
         land(surface.points, landing, leftover.target.units, motions[h], sample, L)
         _source_features(source, target, sample, L, size, row)
-        _motion_features(source.values, surface.step, carried, background[0], motions[h], sample, L, long, row)
+        _motion_features(source.values, surface.step, carried, background, motions[h], sample, L, long, row)
         target_features(target, landing.scan.boxes.small, near, open_near, sample, L, size, long, marks, h, row)
     _rival_features(hypotheses, features)
     return features
@@ -190,12 +190,12 @@ def _source_features(source: Points, target: Points, sample: Sample, L: int, siz
 
 @kernel
 def _motion_features(
-    source: Array, step: float, carried: Array, heading: float, motion: Array, sample: Sample, L: int, long: float, row: Array
+    source: Array, step: float, carried: Array, background: Array, motion: Array, sample: Sample, L: int, long: float, row: Array
 ) -> None:
     """How far the motion is from the background's.
 
     Args:
-        source: (P, 9). step: radians. carried: (P, 2), heading: radians, of the background. motion: (3,).
+        source: (P, 9). step: radians. carried: (P, 2) points under the background's motion (3,). motion: (3,).
         long: metres, extent of the members.
     """
     x = y = ranges = unit = 0.0
@@ -204,8 +204,7 @@ def _motion_features(
         x, y = x + (sample.moved[0, k] - carried[i, 0]) / L, y + (sample.moved[1, k] - carried[i, 1]) / L
         ranges, unit = ranges + source[i, RANGE] / L, unit + source[i, UNIT] / L
     length = max(math.sqrt(x * x + y * y), 1e-6)
-    cos, sin = math.cos(heading), math.sin(heading)
-    back_x, back_y = cos * x + sin * y, cos * y - sin * x  # the shift turned back, instead of every tangent ahead
+    back_x, back_y = rotate_back(transform_of(background), x, y)  # the shift turned back, instead of every tangent ahead
     along = 0.0
     for k in range(L):
         i = sample.member[k]
@@ -215,7 +214,7 @@ def _motion_features(
     row[AT.displacement_in_range] = length / ranges
     row[AT.displacement_in_extent] = math.log1p(length / max(long, 1e-6))
     row[AT.along_surface] = along / L / length
-    row[AT.rotation] = math.log1p(abs(wrap(motion[0] - heading)) / USUAL_TURN)
+    row[AT.rotation] = math.log1p(abs(wrap(motion[0] - background[0])) / USUAL_TURN)
 
 
 # --- what others explain ------------------------------------------------------------------------------------------------------

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.rigid import apply_to_some
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.hypotheses import pick
 from torchcrf_scan.search.leftover import residual_at
@@ -54,19 +54,10 @@ def land(points: Array, target: ScanGrid, units: Array, motion: Array, sample: S
 
     points: (P, 2) of the source. units: (M,) metres. motion: (3,).
     """
-    carry_members(points, motion, sample.member[:L], sample.moved)
+    apply_to_some(motion, points, sample.member[:L], sample.moved)
     residual_at(sample.moved, target, units, sample.units[:L], sample.nearest[:L])
     for k in range(L):
         sample.sight[k] = look_along(target.scan, sample.moved[0, k], sample.moved[1, k])
-
-
-@kernel
-def carry_members(points: Array, motion: Array, index: Integers, moved: Array) -> None:
-    """Writes members (L,) of points (P, 2) under a motion (3,) to (2, L or more)."""
-    cos, sin = math.cos(motion[0]), math.sin(motion[0])
-    for k in range(len(index)):
-        x, y = points[index[k], 0], points[index[k], 1]
-        moved[0, k], moved[1, k] = cos * x - sin * y + motion[1], sin * x + cos * y + motion[2]
 
 
 @kernel

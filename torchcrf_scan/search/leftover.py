@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops import rigid as geometry
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.rigid import apply, apply_to_rows, inverse
 from torchcrf_scan.search.background import unit_length
 from torchcrf_scan.search.grid import HALF_SPACING, ScanGrid, locate
-from torchcrf_scan.search.registration import carry
 from torchcrf_scan.search.surface import Surface, look_along, number_runs
 
 TRUNCATION = 3.0  # a residual of three units is as bad as any
@@ -55,10 +54,10 @@ class Leftover(NamedTuple):
 @kernel
 def leftover_of(source: ScanGrid, target: ScanGrid, background: Array) -> Leftover:
     """background: (3,)."""
-    forward = geometry.apply(background, source.scan.points)
+    forward = apply(background, source.scan.points)
     source_units, target_units = _point_units(source), _point_units(target)
     here = _unexplained(source, source_units, background, target, target_units)
-    there = _unexplained(target, target_units, geometry.inverse(background), source, source_units)
+    there = _unexplained(target, target_units, inverse(background), source, source_units)
     return Leftover(here, there, background, forward, unit_length(source.scan, target.scan))
 
 
@@ -84,7 +83,7 @@ def _unexplained(grid: ScanGrid, units: Array, motion: Array, other: ScanGrid, o
     """motion: (3,) into the frame of the other."""
     P = len(units)
     moved, residual, index, sight = np.empty((2, P)), np.empty(P), np.empty(P, np.int64), np.empty(P, np.int64)
-    carry(motion, grid.scan.points, moved)
+    apply_to_rows(motion, grid.scan.points, moved)
     residual_at(moved, other, other_units, residual, index)
     for i in range(P):
         sight[i] = look_along(other.scan, moved[0, i], moved[1, i])

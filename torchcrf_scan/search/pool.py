@@ -13,7 +13,7 @@ import torch
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.median import lower_median
-from torchcrf_scan.loops.rigid import wrap
+from torchcrf_scan.loops.rigid import compose, wrap
 from torchcrf_scan.search.background import background_cost, every, polish, refine, stride_of, unit_length
 from torchcrf_scan.search.cold import shape_motions
 from torchcrf_scan.search.grid import ScanGrid
@@ -71,11 +71,7 @@ def shifted_from(grid: Array, guesses: Array) -> Array:
     starts = np.empty((len(guesses) * len(grid), 3))
     for g in range(len(guesses)):
         for h in range(len(grid)):
-            cos, sin = math.cos(grid[h, 0]), math.sin(grid[h, 0])
-            start = starts[g * len(grid) + h]
-            start[0] = wrap(grid[h, 0] + guesses[g, 0])
-            start[1] = cos * guesses[g, 1] - sin * guesses[g, 2] + grid[h, 1]
-            start[2] = sin * guesses[g, 1] + cos * guesses[g, 2] + grid[h, 2]
+            starts[g * len(grid) + h] = compose(grid[h], guesses[g])
     return starts
 
 
