@@ -146,14 +146,27 @@ def shared_scores(score: Array, places: Integers) -> Array:
     return together
 
 
+class Sums(NamedTuple):
+    """Sums over the P points of a fit, with weights w, residuals r and Jacobians J.
+
+    Attributes:
+        score: (P, 3) w J^T r of every point; step: (3,) their sum. normal: (3, 3) w J^T J, apart: (3, 3) w^2 J^T J, both symmetric.
+        total: of the weights. variance: of a residual.
+    """
+
+    score: Array
+    step: Array
+    normal: Array
+    apart: Array
+    total: float
+    variance: float
+
+
 @kernel
-def cluster_covariance(
-    fit: Fit, places: Integers, motion: Array, metric: int, noise: float, reach: float
-) -> tuple[Array, Array, Array]:
-    """(3, 3) covariance, (3,) information and (3, 3) directions of one motion; what they are says `inference.uncertainty`."""
-    P = len(places)
-    score, step = np.empty((P, 3)), np.zeros(3)
-    apart, normal = np.zeros((3, 3)), np.zeros((3, 3))
+def sums_of(fit: Fit, noise: float) -> Sums:
+    """Sums over the points of a fit. noise: standard deviation of a return."""
+    P = len(fit.weights)
+    score, step, apart, normal = np.empty((P, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     total = squares = free = 0.0
     for p in range(P):
         w, j = fit.weights[p], fit.jacobian[p]
@@ -168,40 +181,64 @@ def cluster_covariance(
                 both = w * (j[0, r] * j[0, d] + j[1, r] * j[1, d])
                 normal[r, d] += both
                 apart[r, d] += w * both
-    total = max(total, 1e-9)
-    variance = max(2 * noise**2, squares / max(free, 1e-9))
-    meat = shared_scores(score, places)
+    for r in range(3):
+        for d in range(r):
+            normal[r, d], apart[r, d] = normal[d, r], apart[d, r]
+    return Sums(score, step, normal, apart, max(total, 1e-9), max(2 * noise**2, squares / max(free, 1e-9)))
+
+
+@kernel
+def score_covariance(sums: Sums, places: Integers) -> Array:
+    """(3, 3) covariance of the summed score, the middle of the sandwich estimator. places: (P,) of the points, ascending."""
+    meat = shared_scores(sums.score, places)
     for r in range(3):
         for d in range(3):
-            low, high = min(r, d), max(r, d)
-            meat[r, d] += variance * (apart[low, high] + (NOTHING if r == d else 0.0)) + step[r] * step[d]
-    for r in range(3):
-        for d in range(r, 3):
-            normal[r, d] /= total
-            normal[d, r] = normal[r, d]
-    information, directions = axes_of(normal)
+            meat[r, d] += sums.variance * (sums.apart[r, d] + (NOTHING if r == d else 0.0)) + sums.step[r] * sums.step[d]
+    return meat
+
+
+@kernel
+def projection_on(information: Array, directions: Array) -> Array:
+    """(3, 3) projection on the directions (3, 3), a row each, whose information (3,) is large enough to count."""
     keep = np.zeros((3, 3))
     for k in range(3):
         if information[k] >= LEAST_SHARE:
             for r in range(3):
                 for d in range(3):
                     keep[r, d] += directions[k, r] * directions[k, d]
-    if metric != POINT:  # by what is left of the tangents' noise, and by steps along the surface
+    return keep
+
+
+@kernel
+def cluster_covariance(
+    fit: Fit, places: Integers, motion: Array, metric: int, noise: float, reach: float
+) -> tuple[Array, Array, Array]:
+    """(3, 3) covariance, (3,) information and (3, 3) directions of one motion, as `inference.uncertainty` defines them.
+
+    Args:
+        places: (P,) the cluster's points, ascending. motion: (3,). metric: POINT, else point-to-line.
+        noise: standard deviation of a return. reach: largest distance of a source point from the sensor.
+    """
+    sums = sums_of(fit, noise)
+    normal, total = sums.normal, sums.total
+    for r in range(3):
+        for d in range(3):
+            normal[r, d] /= total
+    information, directions = axes_of(normal)
+    if metric != POINT:  # information that the tangents' noise and the steps along the surface only pretend
         for r in range(3):
             normal[r, r] -= LEAST_SHARE
+    keep = projection_on(information, directions)
     bread = product(product(keep, normal), keep)
-    known = product(product(bread, inverse_of(meat)), bread)
+    known = product(product(bread, inverse_of(score_covariance(sums, places))), bread)
     for r in range(3):
         for d in range(3):
             known[r, d] *= total * total
     known[0, 0] += 3 / (math.pi * fit.length) ** 2
     known[1, 1] += 1 / reach**2
     known[2, 2] += 1 / reach**2
-    return (
-        about_origin(inverse_of(known), fit.length, motion[1] - fit.centre[0], motion[2] - fit.centre[1]),
-        information,
-        directions,
-    )
+    x, y = motion[1] - fit.centre[0], motion[2] - fit.centre[1]
+    return about_origin(inverse_of(known), fit.length, x, y), information, directions
 
 
 @kernel

@@ -32,7 +32,7 @@ from torchcrf_scan.search.landing import EXPLAINED, Sample, empty_sample, land, 
 from torchcrf_scan.search.leftover import OPEN, Leftover
 from torchcrf_scan.search.score import FEATURES
 from torchcrf_scan.search.surface import OCCLUDED, SEEN_THROUGH, UNMEASURED
-from torchcrf_scan.search.target_features import Marks, reach_of_runs, target_features
+from torchcrf_scan.search.target_features import target_features, target_scan_of
 
 AROUND = 15  # beams
 RIVALS = 0.7  # share of points in common from which two hypotheses move nearly the same
@@ -49,8 +49,7 @@ def hypothesis_features(leftover: Leftover, hypotheses: Hypotheses) -> Array:
     target = points_of(leftover.target, leftover.target.residual >= OPEN)
     summed, usual_range = _sums(leftover.source.residual), lower_median(surface.ranges)
     open_points = (leftover.source.residual >= OPEN).sum()
-    near, open_near = reach_of_runs(target.values)
-    sample, marks = empty_sample(), Marks(np.full(len(landing.features), -1), np.full(len(landing.features), -1))
+    sample, around = empty_sample(), target_scan_of(target, landing.scan.boxes.small)
     L, long = 0, 0.0
     for h in range(len(features)):
         s, row = group[h], features[h]
@@ -65,7 +64,7 @@ def hypothesis_features(leftover: Leftover, hypotheses: Hypotheses) -> Array:
         land(surface.points, landing, leftover.target.units, motions[h], sample, L)
         _source_features(source, target, sample, L, size, row)
         _motion_features(source.values, surface.step, carried, background, motions[h], sample, L, long, row)
-        target_features(target, landing.scan.boxes.small, near, open_near, sample, L, size, long, marks, h, row)
+        target_features(around, sample, L, size, long, h, row)
     _rival_features(hypotheses, features)
     return features
 
