@@ -1,4 +1,4 @@
-"""What the encoder sees of the points, `encoder.aligned` in loops: one scan at a time, point by point."""
+"""Input channels of the encoder, one scan at a time, point by point; `encoder.aligned` without batches."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def along_scan(sweep: Sweep, place: int) -> int:
 
 @kernel
 def fill_own(sweep: Sweep, i: int, unit: float, usual: float, channels: Array) -> None:
-    """What a scan says of its own point i. channels: (F,)."""
+    """Writes the channels of point i that its own scan determines. channels: (F,)."""
     f = 0
     for k in BESIDE:
         beside = along_scan(sweep, i + k)
@@ -82,7 +82,7 @@ def surface_about(sweep: Sweep, points: Array, x: float, y: float, after: int, u
 
 @kernel
 def fill_cross(sweep: Sweep, points: Array, x: float, y: float, unit: float, channels: Array) -> float:
-    """What the other scan says of a point in its frame; returns the units to its nearest point. channels: (F,)."""
+    """Writes the channels of a point in the other scan's frame; returns the units to the nearest point there. channels: (F,)."""
     dx, dy = x - sweep.origin[0], y - sweep.origin[1]
     bearing, after = beam_after(sweep, dx, dy)
     reach = math.sqrt(dx * dx + dy * dy)
@@ -154,11 +154,11 @@ def aligned_inputs_of_pairs(
 ) -> tuple[Tensor, ...]:
     """`encoder.aligned.aligned_inputs` of some pairs, in double precision, padded to so many source and target points."""
 
-    def look(b: int) -> list[Array]:
+    def channels_of_pair(b: int) -> list[Array]:
         pair, start = pairs[b], starts[b]
         log_odds = start.log_odds if len(start.log_odds) else np.where(start.active, np.inf, -np.inf)
         sides = (False, True) if both else (False,)
         return [channels_of_side(pair, start.motions, log_odds, start.reach, is_target) for is_target in sides]
 
-    found = for_each(look, range(len(pairs)))
+    found = for_each(channels_of_pair, range(len(pairs)))
     return tuple(padded([of[k] for of in found], (lengths[k], WIDTH), 0.0) for k in range(1 + both))

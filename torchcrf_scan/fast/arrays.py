@@ -16,7 +16,7 @@ from torchcrf_scan.loops.nearest import Boxes
 
 
 class Fitted(NamedTuple):
-    """What was learned, as arrays and numbers; `inference.joint.Parameters`.
+    """Fitted weights, scales and calibration as arrays and numbers; `inference.state.Parameters`.
 
     Attributes:
         association_calibration, cluster_calibration: (2,) slope and offset of the confidences.
@@ -32,7 +32,7 @@ class Fitted(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """What of the configuration decoding asks for; `metric` is a place in `motion.METRICS`."""
+    """The part of the configuration that the rounds use; `metric` is a place in `motion.METRICS`."""
 
     candidates: int
     iterations: int
@@ -47,7 +47,7 @@ class Settings(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """The answer, metres; the attributes are those of `batch.Prediction`.
+    """The answer, metres; the attributes are those of `prediction.Prediction`.
 
     Attributes:
         association, cluster: (N,). motions: (C, 3). active: (C,). candidates: (N, K).
@@ -75,7 +75,7 @@ class Scene(NamedTuple):
     """A pair in the unit that features are measured in, and what does not change from round to round.
 
     Attributes:
-        factor: that unit's on metres. source: (N, 2), target: (M, 2). noise: of a return.
+        factor: units in a metre. source: (N, 2), target: (M, 2). noise: of a return.
         tangents: (M, 2) of the target. reach: (N, C).
         outlier, moving: (N,) log potentials of `features.learned.ExtraLogUnary`.
     """
@@ -95,7 +95,7 @@ class Scene(NamedTuple):
 
 
 class State(NamedTuple):
-    """One round's; `inference.joint.State`.
+    """State of one pair after a round; `inference.joint.State`.
 
     Attributes:
         motions: (C, 3). active: (C,). empty_for: (C,). association, cluster: (N,).
@@ -113,7 +113,7 @@ class State(NamedTuple):
 
 
 def fitted_of(parameters: Parameters) -> Fitted:
-    """The learned numbers out of their tensors, once for all pairs."""
+    """The fitted parameters as arrays and numbers, once for all pairs."""
     calibration = parameters.calibration
     return Fitted(
         association_model(parameters),

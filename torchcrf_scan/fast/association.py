@@ -1,7 +1,6 @@
-"""The association chain of one pair: potentials with the weights put in on the fly, and an exact pass over the chain.
+"""The association chain of one pair: potentials with the weights applied on the fly, and an exact pass over the chain.
 
-Does what `features.association`, `features.extension` and `inference.joint.update_association` do. What does not depend on the
-motions is kept from round to round.
+The potentials are those of `features.association` and `features.extension`.
 """
 
 from __future__ import annotations
@@ -78,7 +77,7 @@ def log_unary_of(
 ) -> Array:
     """(N, K+1) log potentials of the workspace's candidates and, last, of the outlier.
 
-    moved: (N, 2) source points under their own motion; seen_through, hidden: (N,) what the target's beams say of them.
+    moved: (N, 2) source points under their own motion; seen_through, hidden: (N,) their free-space tests in the target.
     """
     N, K = work.candidates.shape
     weights = model.weights
@@ -167,7 +166,7 @@ def _in_sequence(index: Integers) -> tuple[Integers, Integers]:
 
 @kernel
 def _send(scores: Array, partner: Integers, sequence: float, switch: float, stay: float, message: Array) -> None:
-    """A message over an edge that asks only for sequence and outliers: time grows with K, not its square.
+    """Message over an edge that depends on sequence and outliers alone: time grows with K, not its square.
 
     scores: (K+1,) of the one node. partner: (K,) its state in sequence with every state of the other, or -1. message: (K+1,).
     """
@@ -188,7 +187,7 @@ def _send(scores: Array, partner: Integers, sequence: float, switch: float, stay
 
 @kernel
 def beliefs_in_sequence(log_unary: Array, index: Integers, sequence: float, switch: float, stay: float) -> Array:
-    """(N, K+1) `max_marginals` of a chain whose edges ask only for sequence and outliers. index: (N, K), ascending where real."""
+    """(N, K+1) `max_marginals` of a chain whose edges depend on sequence and outliers alone. index: (N, K), ascending if real."""
     N, S = log_unary.shape
     before, after = _in_sequence(index)
     beliefs, message, scores = np.empty((N, S)), np.zeros(S), np.empty(S)
@@ -240,7 +239,7 @@ def associate(
     Args:
         work: of the same N and K; the same one for all rounds of a pair.
         index, mask: (N, K) candidates, real ones first and ascending.
-        moved: (N, 2) source points under their own motion. seen_through, hidden: (N,) what the target's beams say of them.
+        moved: (N, 2) source points under their own motion. seen_through, hidden: (N,) their free-space tests in the target.
         extra: (N,) learned log potential of the outlier.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The target points that a source point may have become; `features.candidates` for one pair, by a search, not all distances."""
+"""Candidate target points of every source point; `features.candidates` for one pair, by a search, not all distances."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _insert(distance: float, j: int, last: int, squared: Array, index: Integers)
 
 @kernel
 def _improve(boxes: Boxes, moved: Array, i: int, member: Integers, squared: Array, index: Integers, guess: Integers) -> None:
-    """Takes into the list (K,) of source point i what is nearer than its last, and finds the nearest point under every motion.
+    """Improves the list (K,) of source point i to its nearest points, and finds the nearest point under every motion.
 
     member: (M,) is i for the points in the list. guess: (A,) a point that may be the nearest, and afterwards is; the first of them.
     """

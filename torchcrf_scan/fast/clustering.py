@@ -1,7 +1,7 @@
 """The clustering chain of one pair: potentials without feature tensors, and an exact pass.
 
-`features.clustering`, `features.extension` and `features.potentials` in loops: the weights are applied on the fly, and only
-clusters that exist cost anything.
+The potentials are those of `features.clustering`, `features.extension` and `features.potentials`; the weights are applied on the
+fly, and only clusters that exist cost anything.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class ClusteringWeights(NamedTuple):
 
 
 class ClusteringModel(NamedTuple):
-    """What was learned of the clustering chain; the scales are those of `features.scales.Scales`."""
+    """Fitted weights and scales of the clustering chain; the scales are those of `features.scales.Scales`."""
 
     weights: ClusteringWeights
     cluster_distance: float
@@ -60,7 +60,7 @@ class ClusteringModel(NamedTuple):
 
 
 def clustering_model(parameters: Parameters) -> ClusteringModel:
-    """The learned numbers out of their tensors."""
+    """The fitted weights and scales as numbers."""
     weights = dict(zip(CLUSTERING_WEIGHTS, parameters.clustering.detach().double().tolist(), strict=True))
     scales = parameters.scales
     return ClusteringModel(
@@ -74,7 +74,7 @@ def clustering_model(parameters: Parameters) -> ClusteringModel:
 
 
 class Tables(NamedTuple):
-    """Everything of the chain's potentials at some motions and associations; any of the clusters may still be left out.
+    """Potentials of the chain at some motions and associations, before any of the clusters is left out.
 
     Attributes:
         moved: (C, N, 2) source points under every motion.
@@ -163,7 +163,7 @@ def fill_residual(
 def fill_agreement(
     moved: Array, residual: Array, association: Integers, reach: Booleans, c: int, model: ClusteringModel, log_inlier: Array
 ) -> None:
-    """Potentials (N,) of cluster c but for what beams say, -inf beyond its reach. Other arguments as in `tabulate`."""
+    """Writes the potentials (N,) of cluster c without free-space tests, -inf beyond its reach. See `tabulate` for the arguments."""
     w = model.weights
     for i in range(len(moved)):
         if not reach[i, c]:
@@ -177,9 +177,9 @@ def fill_agreement(
 
 @kernel
 def subtract_ahead(sweep: Sweep, moved: Array, model: ClusteringModel, log_inlier: Array, log_outlier: Array) -> None:
-    """Takes off what the target's beams say against (N, 2) moved points, where they may be in the cluster.
+    """Subtracts the free-space penalties of (N, 2) moved points in the target, where they may be in the cluster.
 
-    log_inlier: (N,). log_outlier: (N,), the outliers', which gain by what is said against the background; of movers (0,).
+    log_inlier: (N,). log_outlier: (N,), of the outlier, which gains by the background's penalties; (0,) for movers.
     """
     w = model.weights
     is_background = len(log_outlier) > 0
@@ -197,7 +197,7 @@ def subtract_ahead(sweep: Sweep, moved: Array, model: ClusteringModel, log_inlie
 def subtract_back(
     sweep: Sweep, target: Array, motion: Array, association: Integers, model: ClusteringModel, log_inlier: Array
 ) -> None:
-    """Takes off what the source's beams say against the points' partners. motion: (3,) of the cluster; log_inlier: (N,)."""
+    """Subtracts the free-space penalties of the points' partners in the source. motion: (3,) of the cluster; log_inlier: (N,)."""
     w = model.weights
     if w.seen_through_back == 0 and w.hidden_back == 0:
         return
@@ -223,7 +223,7 @@ def tabulate(
     nearest_target: Integers,
     model: ClusteringModel,
 ) -> Tables:
-    """Motions and associations plugged in.
+    """All potentials at given motions and associations.
 
     Args:
         source: (N, 2); target: (M, 2), and their sweeps.

@@ -1,7 +1,7 @@
-"""Algorithm 1 in blocks for one pair, from the start to the answer; `inference.joint.decode` in loops.
+"""Algorithm 1 in blocks for one pair, from the start to the answer; `inference.joint.decode` without batches.
 
-For the settings that `backend.COMPILED_SETTINGS` lists. The whole of a pair is one call of machine code, so that other threads can
-run meanwhile.
+For the settings that `fast.choice` lists. All rounds of a pair are one call of machine code, so that other threads can run
+meanwhile.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def scaled_motions(motions: Array, factor: float) -> Array:
 
 @kernel
 def scene_of(pair: Pair, start: PairStart, outlier: Array, moving: Array, settings: Settings) -> Scene:
-    """Describes both scans in the unit of the features; outlier, moving: (N,) as in `Scene`."""
+    """The pair in the unit of the features, with its descriptors. outlier, moving: (N,) as in `Scene`."""
     factor = 1.0 if settings.is_metre else REFERENCE_UNIT / resolution(pair.source, pair.target, pair.noise)
     source, target, noise = scaled(pair.source, factor), scaled(pair.target, factor), pair.noise * factor
     guess, origin = pair.initial_motion.copy(), pair.target_origin.copy()
@@ -66,7 +66,7 @@ def scene_of(pair: Pair, start: PairStart, outlier: Array, moving: Array, settin
 
 @kernel
 def certain(labels: Integers, states: int) -> Array:
-    """(N, S) log-beliefs of labels (N,) that are beyond doubt."""
+    """(N, S) log-beliefs that put all belief on labels (N,)."""
     log_beliefs = np.empty((len(labels), states))
     for i in range(len(labels)):
         for s in range(states):
@@ -76,20 +76,20 @@ def certain(labels: Integers, states: int) -> Array:
 
 @kernel
 def first_state(scene: Scene, start: PairStart, is_chosen: bool, settings: Settings) -> State:
-    """The start as a state, all considered movers in it unless they are chosen; `cluster` and beliefs are for `begin` to say."""
+    """The start as a state, all considered movers in it unless they are chosen; `cluster` and beliefs are not filled in yet."""
     N, C = len(scene.source), len(start.motions)
     active = start.active.copy()
     if not is_chosen:
         for c in range(C):
             active[c] = start.log_odds[c] > -np.inf
     motions = scaled_motions(start.motions, scene.factor)
-    nobody, none = np.full(N, -1), np.empty((0, 0))
+    outliers, none = np.full(N, -1), np.empty((0, 0))
     candidates = np.empty((0, 0), np.int64)
-    return State(motions, active, np.zeros(C, np.int64), start.association.copy(), nobody, candidates, none, none)
+    return State(motions, active, np.zeros(C, np.int64), start.association.copy(), outliers, candidates, none, none)
 
 
 def first_beliefs(scene: Scene, state: State, count: int) -> State:
-    """The labels of a start as beliefs, for those who want no rounds at all. count: K."""
+    """The state with the labels of a start as beliefs, the answer without any rounds. count: K."""
     found, mask, _ = by_motion(scene.boxes, scene.source, state.motions, state.active, count)
     candidates, _, place = with_targets(found, mask, state.association)
     C = len(state.motions)
@@ -184,7 +184,7 @@ def iterate(
 
 @kernel
 def read_out(scene: Scene, state: State, converged: bool, iterations: int, fitted: Fitted, settings: Settings) -> Decoded:
-    """The state as the user sees it, and how sure it is."""
+    """The answer in metres, with covariances and confidences."""
     covariance, information, directions = motion_covariance(
         scene.source,
         scene.target,
@@ -223,7 +223,7 @@ def read_out(scene: Scene, state: State, converged: bool, iterations: int, fitte
 def decode_pair(pair: Pair, start: PairStart, outlier: Array, moving: Array, fitted: Fitted, settings: Settings) -> Decoded:
     """Labels, motions and confidences of one pair of at least one point a scan, from its start. No argument is changed.
 
-    outlier, moving: (N,) learned log potentials, see `features.learned.ExtraLogUnary`.
+    outlier, moving: (N,) log potentials of `features.learned.ExtraLogUnary`.
     """
     is_chosen = not settings.is_joint or len(start.log_odds) == 0
     scene = scene_of(pair, start, outlier, moving, settings)
@@ -236,17 +236,17 @@ def decode_pair(pair: Pair, start: PairStart, outlier: Array, moving: Array, fit
 
 
 def decode_nothing(pair: Pair, start: PairStart, outlier: Array, moving: Array, fitted: Fitted, settings: Settings) -> Decoded:
-    """The answer where a scan is empty: outliers, and the motions of the start, of which nothing is known."""
+    """The answer where a scan is empty: outliers, and the motions of the start with the covariances of the prior."""
     N, C = len(pair.source), len(start.motions)
-    nobody = np.full(N, -1)
+    outliers = np.full(N, -1)
     candidates = np.zeros((N, 1), np.int64)
     log_association, log_cluster = certain(np.full(N, 1), 2), certain(np.full(N, C), C + 1)
     uncertainty = motion_covariance(
-        pair.source, pair.target, start.target_tangents, nobody, nobody, start.motions, settings.metric, 1.0, pair.noise
+        pair.source, pair.target, start.target_tangents, outliers, outliers, start.motions, settings.metric, 1.0, pair.noise
     )
     return Decoded(
-        nobody,
-        nobody.copy(),
+        outliers,
+        outliers.copy(),
         start.motions.copy(),
         np.arange(C) == 0,
         candidates,
@@ -254,7 +254,7 @@ def decode_nothing(pair: Pair, start: PairStart, outlier: Array, moving: Array, 
         log_cluster,
         True,
         0,
-        association_confidence(log_association, candidates, nobody, fitted.association_calibration),
-        cluster_confidence(log_cluster, nobody, fitted.cluster_calibration),
+        association_confidence(log_association, candidates, outliers, fitted.association_calibration),
+        cluster_confidence(log_cluster, outliers, fitted.cluster_calibration),
         *uncertainty,
     )

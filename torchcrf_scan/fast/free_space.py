@@ -1,4 +1,4 @@
-"""What the beams of one scan say of points carried into it; `features.free_space` in loops."""
+"""Free-space test of single points in the frame of a scan; `features.free_space` without batches."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ USUAL_STEP = math.radians(0.5)  # of a scan with one point
 
 
 class Sweep(NamedTuple):
-    """A scan of N points as its sensor sees it; the attributes are those of `features.free_space.Sweep`.
+    """Ranges and bearings of a scan of N points; the attributes are those of `features.free_space.Sweep`.
 
     Attributes:
         origin: (2,). ranges, bearings: (N,), the latter rising. step: radians. noise: of a range. is_closed: over the whole circle.
@@ -32,7 +32,7 @@ class Sweep(NamedTuple):
 
 @kernel
 def sweep_of(points: Array, noise: float, is_closed: bool, origin: Array) -> Sweep:
-    """points: (N, 2) in beam order; noise: in their unit; origin: (2,) of the sensor."""
+    """The sweep of (N, 2) points in beam order. noise: in their unit; origin: (2,) of the sensor."""
     ranges, bearings = polar(points, origin)
     turns = np.empty(max(len(points) - 1, 0))
     for i in range(len(turns)):

@@ -1,4 +1,4 @@
-"""ComputeRT of one pair from hard labels; `inference.motion` in loops."""
+"""ComputeRT of one pair from hard labels; `inference.motion` without batches."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ METRICS = ("point", "line", "given")
 
 
 class Members(NamedTuple):
-    """Which points speak for one cluster, and where they went.
+    """The points of one cluster and their partners.
 
     Attributes:
-        points: (P, 2) source points. partner: (P, 2) where they went. tangent: (P, 2) direction of the surface there.
+        points: (P, 2) source points. partner: (P, 2) associated target points. tangent: (P, 2) of the surface there.
     """
 
     points: Array
@@ -43,7 +43,7 @@ def places_of(association: Integers, cluster: Integers, c: int) -> Integers:
 
 @kernel
 def members_of(source: Array, target: Array, tangents: Array, association: Integers, places: Integers) -> Members:
-    """What the points at P places say. source: (N, 2); target, tangents: (M, 2); association: (N,); places: (P,)."""
+    """The points at P places with their partners. source: (N, 2); target, tangents: (M, 2); association: (N,); places: (P,)."""
     P = len(places)
     points, partner, tangent = np.empty((P, 2)), np.empty((P, 2)), np.empty((P, 2))
     for p in range(P):

@@ -1,7 +1,4 @@
-"""The rounds of whole pairs in loops, without gradients: from where they start to the answer.
-
-Every pair is worked on by one thread.
-"""
+"""The rounds of whole pairs, one thread for every pair, without gradients: from the start to the answer."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from torchcrf_scan.loops.rigid import wrap
 
 @kernel
 def tables_of(scene: Scene, state: State, model: ClusteringModel) -> Tables:
-    """The clustering chain at a round's motions and associations."""
+    """Potentials of the clustering chain at a state's motions and associations."""
     nearest = nearest_to_outliers(scene.boxes, scene.source, state.motions, state.active, state.association)
     tables = tabulate(
         scene.source,
@@ -55,8 +55,8 @@ def nearest_clusters(tables: Tables, reach: Booleans, association: Integers) -> 
 
 
 @kernel
-def look_at_all(sweep: Sweep, points: Array) -> tuple[Array, Array]:
-    """(N,) seen through and (N,) hidden; points: (N, 2)."""
+def free_space_of(sweep: Sweep, points: Array) -> tuple[Array, Array]:
+    """Free-space test of (N, 2) points: (N,) seen through and (N,) hidden, each from 0 to 1."""
     seen_through, hidden = np.empty(len(points)), np.empty(len(points))
     for i in range(len(points)):
         seen_through[i], hidden[i] = look(sweep, points[i, 0], points[i, 1])
@@ -89,7 +89,7 @@ def step(scene: Scene, state: State, tables: Tables, kept: Kept, work: Workspace
     log_cluster, labels = cluster(tables, state.active, fitted.clustering)
     motions = refit(scene, state, labels, state.motions, fitted, settings)
     moved = registered_points(scene.source, motions, state.active, log_cluster)
-    seen_through, hidden = look_at_all(scene.target_sweep, moved)
+    seen_through, hidden = free_space_of(scene.target_sweep, moved)
     log_association, association = associate(
         fitted.association, scene.descriptors, work, index, mask, moved, seen_through, hidden, scene.outlier
     )

@@ -1,6 +1,6 @@
 """Association features that do not depend on the motions (L1..L11 and their boosters), kept from round to round.
 
-`features.association` for one pair, with the weights put in at once.
+`features.association` for one pair, with the weights applied at once.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TOGETHER = 256  # pairs of points whose features are computed at once: few enoug
 
 
 class AssociationModel(NamedTuple):
-    """What was learned of the association chain (`features.scales.Scales`).
+    """Fitted weights, scales and boosters of the association chain (`features.scales.Scales`).
 
     Attributes:
         weights: (23,). per_local: (12,), per_pairwise: (2,) one over the scales. local_outlier: (12,). pairwise_outlier: (2,).
@@ -43,7 +43,7 @@ class AssociationModel(NamedTuple):
 
 
 def association_model(parameters: Parameters) -> AssociationModel:
-    """The parameters as arrays; build it once."""
+    """The fitted parameters as arrays, once for all pairs."""
     scales = parameters.scales
     buffers = (scales.local, scales.local_outlier, scales.pairwise, scales.pairwise_outlier)
     local, local_outlier, pairwise, pairwise_outlier = (double_array(values) for values in buffers)
@@ -54,11 +54,11 @@ def association_model(parameters: Parameters) -> AssociationModel:
 
 
 class AssociationPair(NamedTuple):
-    """Two scans as the chain sees them, in the unit of the features.
+    """Points and descriptors of two scans, in the unit of the features.
 
     Attributes:
         source: (N, 2), target: (M, 2) points.
-        of_source: (N, 18), of_target: (M, 18) what surrounds them: lengths in the order of channels L1..L3 and L7..L9, after and
+        of_source: (N, 18), of_target: (M, 18) descriptors: lengths in the order of channels L1..L3 and L7..L9, after and
             before the point in turn, angles, radius, and the position, that of the source under the initial motion.
     """
 
@@ -69,7 +69,7 @@ class AssociationPair(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """What is kept from round to round, filled in by `associate`; answers do not depend on it.
+    """Static scores kept from round to round, brought up to date by `associate`; answers do not depend on it.
 
     Attributes:
         is_known: (N,) whether the rest is there. candidates, mask: (N, K) what it is of.
@@ -87,7 +87,7 @@ class Workspace(NamedTuple):
 
 @kernel
 def workspace(N: int, K: int) -> Workspace:
-    """An empty one for N source points with K candidates each."""
+    """An empty workspace for N source points with K candidates each."""
     index, mask = np.empty((N, K), np.int64), np.empty((N, K), np.bool_)
     return Workspace(np.zeros(N, np.bool_), index, mask, np.zeros((N, K)), np.zeros((N, K)), np.empty(N))
 
@@ -172,7 +172,7 @@ def _best_of_points(channels: Array, mask: Booleans, points: Integers) -> Array:
 
 @kernel
 def _update_points(model: AssociationModel, pair: AssociationPair, work: Workspace, points: Integers) -> None:
-    """Computes what is kept of some source points (R,) from their candidates."""
+    """Updates the workspace of some source points (R,) from their candidates."""
     K = work.candidates.shape[1]
     channels = _static_channels(_differences(pair, work, points), model.per_local)
     best = _best_of_points(channels, work.mask, points)

@@ -1,4 +1,4 @@
-"""How sure the answer for one pair is; `inference.uncertainty` in loops."""
+"""Covariance of the motions and calibrated confidence of the labels of one pair; `inference.uncertainty`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchcrf_scan.loops.rigid import rotate, transform, transform_of
 from torchcrf_scan.loops.solve import axes_of, inverse_of, product
 from torchcrf_scan.prediction import LEAST_SHARE
 
-EXCLUDED = math.exp(2 * MOST_CERTAIN)  # what a state counts in the sum that it is left out of
+EXCLUDED = math.exp(2 * MOST_CERTAIN)  # belief of a state in the sum that excludes it
 
 
 class Fit(NamedTuple):
@@ -243,7 +243,7 @@ def cluster_covariance(
 
 @kernel
 def about_origin(local: Array, length: float, x: float, y: float) -> Array:
-    """(3, 3) covariance of (theta, tx, ty) from that of (theta L, x, y) about a centroid that (x, y) leads to t from."""
+    """(3, 3) covariance of (theta, tx, ty) from that of (theta L, x, y) about a centroid; (x, y): from there to the translation."""
     change = np.zeros((3, 3))
     change[0, 0], change[1, 0], change[2, 0] = 1 / length, -y / length, x / length
     change[1, 1] = change[2, 2] = 1.0
@@ -295,7 +295,7 @@ def motion_covariance(
 
 @kernel
 def confidence(yes: float, no: float, calibration: Array) -> float:
-    """Calibrated probability of what has belief `yes` against `no`. calibration: (2,) slope and offset."""
+    """Calibrated probability of a statement with beliefs `yes` and `no`. calibration: (2,) slope and offset."""
     return 1 / (1 + math.exp(-(calibration[0] * (math.log(yes) - math.log(no)) + calibration[1])))
 
 

@@ -26,7 +26,7 @@ def solve(a: float, b: float, c: float, d: float, e: float, f: float, x: float, 
 
 @kernel
 def inverse_of(matrix: Array) -> Array:
-    """(3, 3) inverse by elimination with pivots."""
+    """(3, 3) inverse of a matrix (3, 3), by elimination with pivots."""
     left, right = matrix.copy(), np.eye(3)
     for k in range(3):
         pivot = k
@@ -50,7 +50,7 @@ def inverse_of(matrix: Array) -> Array:
 
 @kernel
 def product(a: Array, b: Array) -> Array:
-    """(3, 3) of two such."""
+    """(3, 3) matrix product of two matrices (3, 3)."""
     found = np.zeros((3, 3))
     for r in range(3):
         for d in range(3):
@@ -59,8 +59,8 @@ def product(a: Array, b: Array) -> Array:
 
 
 @kernel
-def turn_away(matrix: Array, vectors: Array, p: int, q: int) -> None:
-    """One of Jacobi's rotations, in place, after which matrix[p, q] is 0. matrix: (3, 3) symmetric; vectors: (3, 3), rows."""
+def jacobi_rotation(matrix: Array, vectors: Array, p: int, q: int) -> None:
+    """Jacobi's rotation that makes matrix[p, q] 0, in place. matrix: (3, 3) symmetric; vectors: (3, 3), a row each."""
     if matrix[p, q] == 0:
         return
     tilt = (matrix[q, q] - matrix[p, p]) / (2 * matrix[p, q])
@@ -88,7 +88,7 @@ def axes_of(symmetric: Array) -> tuple[Array, Array]:
         if aside <= 1e-18 * (abs(matrix[0, 0]) + abs(matrix[1, 1]) + abs(matrix[2, 2])):
             break
         for r in range(3):
-            turn_away(matrix, vectors, r, (r + 1) % 3)
+            jacobi_rotation(matrix, vectors, r, (r + 1) % 3)
     values = np.empty(3)
     for k in range(3):
         values[k] = matrix[k, k]

@@ -1,4 +1,4 @@
-"""Matching by shape alone, when nothing is known of the motion; `inference.cold` in loops.
+"""Matching by shape alone, without any guess of the motion: candidates, an exact chain, two-point RANSAC.
 
 The score of all pairs of points is never held: a source point's row of it is made, its best candidates are kept, and the next row
 takes its place.
@@ -40,7 +40,7 @@ SWITCH, STAY = SWITCHING + DISTANCE * OUTLIER_DISTANCE, DISTANCE * OUTLIER_DISTA
 
 @kernel
 def _rows_of(shape: Shape) -> Array:
-    """(15, P) descriptors in units of their scales: lengths, then angles."""
+    """(15, P) descriptors in units of their scales: lengths, then angles. P: points."""
     rows = np.empty((LENGTHS + ANGLES, len(shape.radius)))
     for i in range(len(shape.radius)):
         for order in range(3):
@@ -150,7 +150,7 @@ def _edge(i: int, j: int, here: Integers, there: Integers, x: Array, y: Array, n
 def best_labels(source: Array, target: Array, index: Integers, score: Array) -> Integers:
     """(N,) target points, -1 outlier, of the best labelling of a chain: forward the best totals, back along what made them.
 
-    Where it is unique it is what the largest max-marginals say.
+    Where it is unique it is also the labelling of the largest max-marginals.
 
     Args:
         source: (N, 2), target: (M, 2) points. index, score: (N, K) candidates.
@@ -192,7 +192,7 @@ def best_labels(source: Array, target: Array, index: Integers, score: Array) -> 
 
 @kernel
 def shape_association(source: Array, target: Array, noise: float, source_closed: bool, target_closed: bool) -> Integers:
-    """(N,) associations, -1 outlier, of a chain that knows shapes and distances along the scan, not positions.
+    """(N,) associations, -1 outlier, of a chain on shapes and distances along the scan, without positions.
 
     Args:
         source: (N, 2), target: (M, 2) points in beam order. noise: metres.
@@ -236,7 +236,7 @@ def sampled_motions(source: Array, target: Array, gate: float, picks: Integers) 
 
 @cache
 def _picks(points: int) -> Integers:
-    """(SAMPLES, 2) the eager function's samples."""
+    """(SAMPLES, 2) pairs of points, drawn with a fixed seed."""
     return torch.randint(points, (SAMPLES, 2), generator=torch.Generator().manual_seed(0)).numpy()
 
 
@@ -254,6 +254,6 @@ def ransac_motions(source: Array, target: Array, gate: float, count: int) -> Arr
 
 
 def shape_motions(source: Surface, target: Surface, gate: float, count: int) -> Array:
-    """(count, 3) motions that `shape_association` speaks for. gate: metres."""
+    """(count, 3) two-point motions that agree with most associations of `shape_association`. gate: metres."""
     match = shape_association(source.points, target.points, source.noise, source.is_closed, target.is_closed)
     return ransac_motions(source.points[match >= 0], target.points[match[match >= 0]], gate, count)

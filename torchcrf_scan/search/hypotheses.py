@@ -1,6 +1,6 @@
-"""Hypothesised motions of movers; `inference.hypotheses` in loops.
+"""Hypothesised motions of movers: groups of the source aligned with groups of the target.
 
-All hypotheses of one set of points follow each other: what the set alone decides is done once.
+All hypotheses of one group follow each other, so that work on the group alone is done once.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def members_of(hypotheses: Hypotheses, which: Integers, count: int) -> Booleans:
 
 @kernel
 def hypothesise(leftover: Leftover, dt: float) -> Hypotheses:
-    """Aligns every segment holding unexplained points with every such segment of the other scan.
+    """Hypotheses that align every group with unexplained points with every such group of the other scan.
 
     By centroid and by both ends (a car is seen to another length in every scan); the best starts are registered.
 
@@ -191,7 +191,7 @@ def _screen(boxes: Boxes, units: Array, farthest: float, points: Array, shift: A
 def residual_units(boxes: Boxes, units: Array, farthest: float, x: float, y: float, guess: int) -> tuple[float, int]:
     """Distance to a scan in its local units, truncated, and the index of its nearest point, -1 where that does not matter.
 
-    units: (M,) metres, farthest: `TRUNCATION` times the largest of them. guess: index that is looked at first, -1: none.
+    units: (M,) metres, farthest: `TRUNCATION` times the largest of them. guess: index that is tried first, -1: none.
     """
     squared, index = nearest_within(boxes, x, y, guess, farthest * farthest)
     return (min(math.sqrt(squared) / units[index], TRUNCATION) if index >= 0 else TRUNCATION), index
@@ -204,7 +204,7 @@ def residual_units(boxes: Boxes, units: Array, farthest: float, x: float, y: flo
 def _settle(
     source: Array, groups: Groups, shift: Array, group: Integers, background: Array, target: ScanGrid, unit: float
 ) -> Array:
-    """(H, 3) registers every start; few points say little of a turn.
+    """(H, 3) registered motions, their turns regularised: few points determine a turn badly.
 
     Args:
         source: (P, 2). shift: (H, 2) after the background, group: (H,). unit: metres.

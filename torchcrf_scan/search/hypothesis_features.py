@@ -1,7 +1,4 @@
-"""What tells a mover's motion from a wrong one; `inference.hypothesis_features` in loops.
-
-Nothing is laid out hypotheses x points: only the boxes of the target within reach of a hypothesis are looked into.
-"""
+"""Features that tell a mover's motion from a wrong one, one hypothesis at a time."""
 
 from __future__ import annotations
 
@@ -36,12 +33,15 @@ from torchcrf_scan.search.target_features import target_features, target_scan_of
 
 AROUND = 15  # beams
 RIVALS = 0.7  # share of points in common from which two hypotheses move nearly the same
-USUAL_UNITS, USUAL_COUNT = 2.0, 3.0  # units in all, and of how many points, that are added to those around: few say little
+USUAL_UNITS, USUAL_COUNT = (
+    2.0,
+    3.0,
+)  # units in all, and of how many points, that are added to those around, a prior against few points
 
 
 @kernel
 def hypothesis_features(leftover: Leftover, hypotheses: Hypotheses) -> Array:
-    """(H, F) what tells a mover's motion from a wrong one, in the order of `FEATURES`; shares, logarithms and local units only."""
+    """(H, F) features of the hypotheses, in the order of `FEATURES`: shares, logarithms and local units only."""
     (start, index), motions, group = hypotheses.groups, hypotheses.motions, hypotheses.group
     surface, landing, carried, background = leftover.source.grid.scan, leftover.target.grid, leftover.carried, leftover.background
     features = np.empty((len(motions), len(FEATURES)))
@@ -71,14 +71,14 @@ def hypothesis_features(leftover: Leftover, hypotheses: Hypotheses) -> Array:
 
 @kernel
 def _sums(residual: Array) -> Array:
-    """(P + 1,) sums of all before every point."""
+    """(P + 1,) running sums of residuals (P,), beginning with 0."""
     summed = np.zeros(len(residual) + 1)
     for i in range(len(residual)):
         summed[i + 1] = summed[i] + residual[i]
     return summed
 
 
-# --- what the members decide alone --------------------------------------------------------------------------------------------
+# --- features of the members alone --------------------------------------------------------------------------------------------
 
 
 @kernel
@@ -132,7 +132,7 @@ def _extent(points: Array, index: Integers) -> tuple[float, float]:
 
 @kernel
 def _scene_features(source: Array, summed: Array, open_points: int, members: Integers, row: Array) -> None:
-    """How well the background fits the beams beside the members, and the rest of the scan. source: (P, 9)."""
+    """Writes the background's residual on the beams beside the members, and its open share of the rest. source: (P, 9)."""
     P, size = len(source), len(members)
     total = inside = 0.0
     upto = wide = open_members = 0
@@ -146,12 +146,12 @@ def _scene_features(source: Array, summed: Array, open_points: int, members: Int
     row[AT.scene_open] = (open_points - open_members) / max(P - size, 1)
 
 
-# --- what a motion decides ----------------------------------------------------------------------------------------------------
+# --- features of a motion --------------------------------------------------------------------------------------------------------
 
 
 @kernel
 def _source_features(source: Points, target: Points, sample: Sample, L: int, size: int, row: Array) -> None:
-    """How well the motion explains the members, and what it says of the points that they land on. size: of the group."""
+    """Writes the residuals and gains of the members, and shares of the points that they land on. size: of the group."""
     residual = gain = fair = 0.0
     explained = seen_through = occluded = 0
     landing_open = landing_through = landing_occluded = landing_unexcused = 0
@@ -191,7 +191,7 @@ def _source_features(source: Points, target: Points, sample: Sample, L: int, siz
 def _motion_features(
     source: Array, step: float, carried: Array, background: Array, motion: Array, sample: Sample, L: int, long: float, row: Array
 ) -> None:
-    """How far the motion is from the background's.
+    """Writes the motion's displacement and turn against the background's.
 
     Args:
         source: (P, 9). step: radians. carried: (P, 2) points under the background's motion (3,). motion: (3,).
@@ -216,12 +216,12 @@ def _motion_features(
     row[AT.rotation] = math.log1p(abs(wrap(motion[0] - background[0])) / USUAL_TURN)
 
 
-# --- what others explain ------------------------------------------------------------------------------------------------------
+# --- comparison with rivals ------------------------------------------------------------------------------------------------------
 
 
 @kernel
 def _rival_features(hypotheses: Hypotheses, features: Array) -> None:
-    """How much worse a hypothesis is than the best that moves nearly the same points."""
+    """Writes how much worse every hypothesis is than the best that moves nearly the same points. features: (H, F)."""
     start, index = hypotheses.groups
     S = len(start) - 1
     best = np.full((S, 3), -np.inf)  # of every group

@@ -1,4 +1,4 @@
-"""Where a hypothesis carries its members; `inference.hypothesis_features.Landing` in loops, one hypothesis at a time."""
+"""Members of a group under a hypothesised motion: residuals, nearest target points and free-space test."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ FEATURE_POINTS = 24
 
 
 class Sample(NamedTuple):
-    """At most `FEATURE_POINTS` members of a group, and where a hypothesis carries them.
+    """At most `FEATURE_POINTS` members of a group under a hypothesis.
 
     Attributes:
         member: (L,) index of the source. moved: (2, L). units: (L,) truncated residual. nearest: (L,) target point.
-        sight: (L,) what the target's beams say of it.
+        sight: (L,) free-space test of it in the target, see `search.surface`.
     """
 
     member: Integers
@@ -34,7 +34,7 @@ class Sample(NamedTuple):
 
 @kernel
 def empty_sample() -> Sample:
-    """Room for one."""
+    """A sample before its members are taken."""
     L = FEATURE_POINTS
     return Sample(np.empty(L, np.int64), np.empty((2, L)), np.empty(L), np.empty(L, np.int64), np.empty(L, np.int64))
 
@@ -50,7 +50,7 @@ def take_members(members: Integers, index: Integers) -> int:
 
 @kernel
 def land(points: Array, target: ScanGrid, units: Array, motion: Array, sample: Sample, L: int) -> None:
-    """Carries the members of `sample` over and looks for their nearest target points.
+    """Moves the L members of `sample` and finds residuals, nearest target points and free-space tests.
 
     points: (P, 2) of the source. units: (M,) metres. motion: (3,).
     """

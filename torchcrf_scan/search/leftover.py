@@ -1,4 +1,4 @@
-"""What a background motion leaves unexplained; the first half of `inference.hypotheses` in loops."""
+"""The leftover of a background motion: residuals and free-space tests of both scans under it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ PIECE_GAP = 2.5  # beam spacings from which two neighbours on a segment may be t
 
 
 class Unexplained(NamedTuple):
-    """One scan of P points and what the background leaves of it.
+    """One scan of P points with its residuals under the background's motion.
 
     Attributes:
         grid: the scan, for nearest points.
         units: (P,) metres, how far from a point a well registered one may lie.
         residual: (P,) units to the other scan, at most `TRUNCATION`.
-        sight: (P,) what the other scan's beams say (`surface.look_along`).
+        sight: (P,) free-space test in the other scan (`surface.look_along`).
         piece: (P,) number of every point's piece.
     """
 
@@ -37,7 +37,7 @@ class Unexplained(NamedTuple):
 
 
 class Leftover(NamedTuple):
-    """What a background motion leaves unexplained, and what else is asked of both scans again and again.
+    """Both scans under a background motion.
 
     Attributes:
         background: (3,). carried: (P, 2) source points under it.
@@ -53,7 +53,7 @@ class Leftover(NamedTuple):
 
 @kernel
 def leftover_of(source: ScanGrid, target: ScanGrid, background: Array) -> Leftover:
-    """background: (3,)."""
+    """The leftover of a background motion (3,)."""
     forward = apply(background, source.scan.points)
     source_units, target_units = _point_units(source), _point_units(target)
     here = _unexplained(source, source_units, background, target, target_units)
@@ -80,7 +80,7 @@ def residual_at(moved: Array, grid: ScanGrid, units: Array, residual: Array, ind
 
 @kernel
 def _unexplained(grid: ScanGrid, units: Array, motion: Array, other: ScanGrid, other_units: Array) -> Unexplained:
-    """motion: (3,) into the frame of the other."""
+    """Residuals and free-space tests of a scan under a motion (3,) into the frame of the other. units: (P,), other_units: (M,)."""
     P = len(units)
     moved, residual, index, sight = np.empty((2, P)), np.empty(P), np.empty(P, np.int64), np.empty(P, np.int64)
     apply_to_rows(motion, grid.scan.points, moved)

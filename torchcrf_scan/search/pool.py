@@ -1,4 +1,4 @@
-"""The search for the background's motion where no guess leads to it: the pool of `inference.background` in loops.
+"""Search for the background's motion where no guess leads to it: a pool of hypotheses, narrowed down in stages.
 
 Every stage takes a range of hypotheses and holds no lock while it works: threads may share the hypotheses of a stage.
 """
@@ -59,7 +59,7 @@ def _reach_of(source: Surface, target: Surface) -> float:
 
 def start_grid(source: Surface, target: Surface) -> Array:
     """(H, 3) turns and shifts in shares of the scene's size."""
-    reach = np.float32(GRID_REACH * _reach_of(source, target))  # single precision, as the eager grid has it
+    reach = np.float32(GRID_REACH * _reach_of(source, target))  # single precision: the labels on record depend on it
     turns, shifts = np.array(GRID_TURNS, np.float32), np.array(GRID_SHIFTS, np.float32)
     grid = np.concatenate([np.repeat(turns, len(shifts))[:, None], np.tile(shifts, (len(turns), 1)) * reach], axis=1)
     return grid.astype(np.float64)
@@ -77,7 +77,7 @@ def shifted_from(grid: Array, guesses: Array) -> Array:
 
 @kernel
 def search_coarsely(motions: Array, source: ScanGrid, target: ScanGrid, unit: float) -> Array:
-    """Registers some of the source's points from afar."""
+    """(H, 3) motions of some of the source's points, registered with wide gates."""
     stride = stride_of(len(source.features), COARSE_POINTS)
     points = every(source.scan.points, stride)
     return register(points, every(source.pull, stride), target, motions, unit * COARSE_GATES, COARSE_ALONG)

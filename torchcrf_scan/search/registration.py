@@ -1,4 +1,4 @@
-"""Robust rigid registration, one hypothesis at a time; `inference.registration` in loops.
+"""Robust rigid registration by Gauss-Newton steps, one hypothesis at a time.
 
 Inside a loop over hypotheses points are (2, P), so that sums over them run along memory.
 """

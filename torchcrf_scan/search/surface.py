@@ -1,4 +1,4 @@
-"""One scan seen as pieces of surface; `inference.surface` in loops, and the free-space test of single points."""
+"""One scan as pieces of surface, and the free-space test of single points."""
 
 from __future__ import annotations
 
@@ -16,11 +16,18 @@ from torchcrf_scan.search.free_space import measured_ranges, range_slack
 GRAZING = math.radians(10.0)  # a surface met at a flatter angle looks like a depth jump (adaptive breakpoint detector)
 WIDEST_TURN = GRAZING * (1 - 1e-4)  # between neighbours on a surface; beams are whole steps apart, and just `GRAZING` is too far
 
-AGREES, SEEN_THROUGH, OCCLUDED, UNMEASURED = 0, 1, 2, 3  # what a beam says of a point
+AGREES, SEEN_THROUGH, OCCLUDED, UNMEASURED = 0, 1, 2, 3  # results of the free-space test
 
 
 class Surface(NamedTuple):
-    """A scan of P points with its geometry; the attributes are those of `inference.surface.Surface`."""
+    """A scan of P points with its geometry.
+
+    Attributes:
+        boxes: round runs of the points. points: (P, 2) in beam order. origin: (2,) of the sensor.
+        ranges, bearings: (P,) from there, the latter rising. spacing: (P,) metres to the nearest point on the same surface.
+        tangent: (P, 2) of the surface, 0 of a point without neighbours. length: (P,) metres of surface that a point stands for.
+        segment: (P,) number of the piece of surface. step: radians between beams. noise: metres, of a range.
+    """
 
     boxes: Boxes
     points: Array
@@ -38,7 +45,7 @@ class Surface(NamedTuple):
 
 @kernel
 def number_runs(joined: Booleans) -> Integers:
-    """(P,) numbers from 0; joined[i] says that i and i + 1 have the same, the last and the first included."""
+    """(P,) numbers from 0; joined[i]: i and i + 1 have the same, the last and the first included."""
     number = np.zeros(len(joined), np.int64)
     for i in range(1, len(joined)):
         number[i] = number[i - 1] + (0 if joined[i - 1] else 1)
@@ -52,7 +59,7 @@ def number_runs(joined: Booleans) -> Integers:
 
 @kernel
 def surface_of(points: Array, noise: float, is_closed: bool, origin: Array) -> Surface:
-    """points: (P, 2) in beam order, P >= 1; noise: metres; origin: (2,) of the sensor."""
+    """The surface of (P, 2) points in beam order, P >= 1. noise: metres; origin: (2,) of the sensor."""
     P = len(points)
     ranges, bearings = polar(points, origin)
     turn, gap = np.empty(P), np.empty(P)
