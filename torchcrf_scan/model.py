@@ -15,8 +15,8 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.choices import STARTS
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.encoder.encoder import ScanEncoder
+from torchcrf_scan.fast.arrays import fitted_of, settings_of
 from torchcrf_scan.fast.choice import can_decode
-from torchcrf_scan.fast.decode import learned_of, settings_of
 from torchcrf_scan.fast.pairs import by_beam, decode_pairs, extras_of, predict
 from torchcrf_scan.features.learned import EMBEDDING_WEIGHTS, Embeddings, ExtraLogUnary, LearnedInputs
 from torchcrf_scan.features.potentials import Boosters, PairView
@@ -204,7 +204,7 @@ class JointScanCRF(nn.Module):
 
     def _in_loops(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
         """The rounds in machine code, one pair a thread, without a gradient."""
-        return predict(batch, start, learned_of(self.fitted), settings_of(self.config), learned)
+        return predict(batch, start, fitted_of(self.fitted), settings_of(self.config), learned)
 
     def _in_tensors(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
         """The same in tensors, all pairs at once, with a gradient where the schedule has one."""
@@ -258,7 +258,7 @@ class JointScanCRF(nn.Module):
         extras = extras_of(
             [len(pair.source) for pair in scans], None if self.encoder is None else self.encoder.of_pairs(scans, starts)
         )
-        answers = decode_pairs(scans, starts, extras, learned_of(self.fitted), settings_of(self.config))
+        answers = decode_pairs(scans, starts, extras, fitted_of(self.fitted), settings_of(self.config))
         return [by_beam(answer, pair) for answer, pair in zip(answers, pairs, strict=True)]
 
     def save_pretrained(self, folder: str | Path) -> None:

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 
 from torchcrf_scan.benchmark.timing import least_seconds, threads_kept
-from torchcrf_scan.features.scales import ASSOCIATION_UNARY, CLUSTERING_UNARY, LOCAL_CHANNELS, SHAPE_CHANNELS
 from torchcrf_scan.features.shape import ORDERS
 from torchcrf_scan.inference.joint import SELECTION_ROUNDS
+from torchcrf_scan.names import ASSOCIATION_UNARY, CLUSTERING_UNARY, LOCAL_CHANNELS, SHAPE_CHANNELS
 from torchcrf_scan.search import cold, hypotheses, pool
 
 COPIED = 2**23  # numbers of a copy, far more than any cache holds

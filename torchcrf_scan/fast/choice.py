@@ -37,7 +37,7 @@ def can_decode(model: ModelConfig, device: torch.device, *, needs_gradient: bool
 
 
 def _why_not_here(device: torch.device) -> str | None:
-    """What the loops would need, where they cannot run."""
+    """What the loops need, where they cannot run; else None."""
     if torch.compiler.is_compiling():
         return "an ordinary call, not a compiled or exported one"
     return f"scans on the CPU, got {device}" if device.type != "cpu" else None

@@ -1,4 +1,4 @@
-"""What the neighbourhood of every point of one scan looks like; `features.shape` in loops."""
+"""Shape descriptors of the neighbourhood of every point of one scan; `features.shape` without batches."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def arm_angle(ux: float, uy: float, vx: float, vy: float) -> float:
 
 @kernel
 def describe(points: Array, is_closed: bool) -> Shape:
-    """points: (P, 2) in beam order, P >= 0."""
+    """Shape descriptors of (P, 2) points in beam order, P >= 0."""
     P = len(points)
     distance, geodesic, angle = np.empty((P, len(ORDERS), 2)), np.empty((P, len(ORDERS), 2)), np.empty((P, len(ORDERS)))
     radius, gap = np.empty(P), np.empty(P)
