@@ -13,7 +13,7 @@ from torchcrf_scan import JointScanCRF
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.fast import arrays, decode, selection
+from torchcrf_scan.fast import arrays, decode, rounds, selection
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.inference import selection as eager
 from torchcrf_scan.inference.joint import first_state
@@ -55,7 +55,7 @@ def test_evidence_and_choice_agree_with_the_eager_ones(seed: int, odds: float) -
     begin, none = start_arrays(start, 0, pair), np.zeros(len(pair.source))
     scene = decode.scene_of(pair, begin, none, none, settings)
     ours = decode.first_state(scene, begin, False, settings)
-    tables = decode.tables_of(scene, ours, learned.clustering)
+    tables = rounds.tables_of(scene, ours, learned.clustering)
     scaled = start.scaled(view.factor).considered()
     expected = eager.evidence(view, scaled, state, fitted, config.inference)
     np.testing.assert_allclose(selection.evidence(tables, ours.active, learned.clustering), expected[0], atol=1e-8)
@@ -76,6 +76,6 @@ def test_the_background_alone_is_never_asked() -> None:
     state = decode.first_state(scene, begin, True, settings)
     state.active[1:] = False
     selection.discard_vacuous(
-        decode.tables_of(scene, state, learned.clustering), state.active, begin.log_odds, learned.clustering, learned.worth
+        rounds.tables_of(scene, state, learned.clustering), state.active, begin.log_odds, learned.clustering, learned.worth
     )
     assert state.active.tolist() == [True] + [False] * (len(state.active) - 1)
