@@ -16,43 +16,37 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 from collections.abc import Sequence
-from pathlib import Path
 
-from jsonargparse import ArgumentParser
-
+from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.evaluation.report import report
-from torchcrf_scan.learning.settings import Config
+from torchcrf_scan.experiment.parser import config_of, settings_parser
 from torchcrf_scan.learning.trainer import train
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Parses the settings, trains, prints the tables."""
-    parser = ArgumentParser(description=__doc__)
-    parser.add_argument("--config", action="config", help="YAML file of settings")
+def main(argv: Sequence[str] | None = None) -> int:
+    """Parses the settings, trains, prints the tables. Returns 0, or 1 for bad input; bad settings leave with exit code 2."""
+    parser = settings_parser(description=__doc__)
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the run folder")
-    parser.add_class_arguments(Config)
     settings = parser.parse_args(argv)
-    resume = settings.pop("resume")
     try:
-        config = Config(**{k: v for k, v in parser.instantiate(settings).items() if k not in ("config", "resume")})
+        config = config_of(parser.instantiate(settings))
     except ValueError as error:
-        parser.error(str(error))
+        parser.error(one_line(error))
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    folder = Path(config.output)
-    is_first = int(os.environ.get("RANK", 0)) == 0  # of the processes that torchrun started
-    if is_first:
-        folder.mkdir(parents=True, exist_ok=True)
-        parser.save(settings, folder / "config.yaml", overwrite=True, skip_validation=True)
-
-    scores = train(config, resume=resume)
-    if not is_first:
-        return
-    for table in report(scores):
-        print(table.to_markdown(), end="\n\n")
-    print(f"run folder: {folder}  (tensorboard --logdir {folder})")
+    try:
+        scores = train(config, resume=settings.resume)
+    except (ValueError, OSError) as error:
+        print(f"train.py: error: {one_line(error)}", file=sys.stderr)
+        return 1
+    if int(os.environ.get("RANK", 0)) == 0:  # the first of the processes that torchrun started
+        for table in report(scores):
+            print(table.to_markdown(), end="\n\n")
+        print(f"run folder: {config.output}  (tensorboard --logdir {config.output})")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

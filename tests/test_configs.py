@@ -10,26 +10,27 @@ from jsonargparse import ArgumentParser
 from support import PAPER_WEIGHTS
 
 from torchcrf_scan.commands.experiment import read_variants
-from torchcrf_scan.config import WEIGHTS, FeatureConfig, InferenceConfig, ModelConfig
-from torchcrf_scan.experiment.settings import ExperimentConfig
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.experiment.settings import ExperimentConfig, RunConfig
 from torchcrf_scan.features.scales import live_weights
-from torchcrf_scan.learning.settings import Config, LearningConfig
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import WEIGHTS
 
 PAPER = FeatureConfig(free_space=False, decisions=False, left_out=())
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 FILES = sorted(path.name for path in CONFIGS.glob("*.yaml"))
 
 
-def parse(*arguments: str) -> Config:
+def parse(*arguments: str) -> RunConfig:
     parser = ArgumentParser(exit_on_error=False)
     parser.add_argument("--config", action="config")
-    parser.add_class_arguments(Config)
+    parser.add_class_arguments(RunConfig)
     settings = parser.instantiate(parser.parse_args(list(arguments)))
-    return Config(**{name: value for name, value in settings.items() if name != "config"})
+    return RunConfig(**{name: value for name, value in settings.items() if name != "config"})
 
 
-def load(name: str, *arguments: str) -> Config:
+def load(name: str, *arguments: str) -> RunConfig:
     return parse(f"--config={CONFIGS / name}", *arguments)
 
 
@@ -40,13 +41,13 @@ def test_the_known_files_are_there() -> None:
 @pytest.mark.parametrize("name", FILES)
 def test_a_file_loads_and_has_a_run_folder_and_a_reason(name: str) -> None:
     config = load(name)
-    assert config != Config()
+    assert config != RunConfig()
     assert config.output == f"runs/{Path(name).stem}"
     assert (CONFIGS / name).read_text().startswith("# ")
 
 
 def test_without_a_file_everything_is_the_default() -> None:
-    assert parse() == Config()
+    assert parse() == RunConfig()
 
 
 def test_the_paper_is_the_paper() -> None:
@@ -98,12 +99,12 @@ ABLATIONS = CONFIGS / "ablations"
 
 
 @pytest.fixture(scope="module")
-def variants() -> dict[str, Config]:
+def variants() -> dict[str, RunConfig]:
     return read_variants(ABLATIONS, load("paper.yaml"))
 
 
 @pytest.mark.parametrize("path", sorted(ABLATIONS.glob("*.yaml")), ids=lambda path: path.stem)
-def test_an_ablation_has_a_reason_and_changes_the_paper(path: Path, variants: dict[str, Config]) -> None:
+def test_an_ablation_has_a_reason_and_changes_the_paper(path: Path, variants: dict[str, RunConfig]) -> None:
     assert path.read_text().startswith("# ")
     paper = load("paper.yaml")
     if path.stem == "without_a_feature":
@@ -113,7 +114,7 @@ def test_an_ablation_has_a_reason_and_changes_the_paper(path: Path, variants: di
         assert (variants[path.stem].data, variants[path.stem].output) == (paper.data, paper.output)  # the same pairs
 
 
-def test_no_two_ablations_are_the_same(variants: dict[str, Config]) -> None:
+def test_no_two_ablations_are_the_same(variants: dict[str, RunConfig]) -> None:
     assert len({str(config) for config in variants.values()}) == len(variants) > 40
 
 
@@ -126,7 +127,7 @@ def test_an_ablation_of_the_default_has_a_reason_and_changes_it() -> None:
         assert (variants[path.stem].data, variants[path.stem].output) == (default.data, default.output), path
 
 
-def test_every_feature_is_left_out_in_turn(variants: dict[str, Config]) -> None:
+def test_every_feature_is_left_out_in_turn(variants: dict[str, RunConfig]) -> None:
     paper = load("paper.yaml")
     without = {name.removeprefix("without "): config for name, config in variants.items() if name.startswith("without ")}
     for name, config in without.items():
@@ -167,7 +168,7 @@ def test_a_variant_keeps_what_it_does_not_name(tmp_path: Path) -> None:
 )
 def test_values_out_of_range_are_named(config: type, name: str, value: object) -> None:
     last = value[-1] if isinstance(value, tuple) else value
-    with pytest.raises(ValueError, match=f"{'worlds' if name == 'also_train' else name}: expected .*, got {last}"):
+    with pytest.raises(ValueError, match=f"{name}: expected .*, got {last}"):
         config(**{name: value})
 
 

@@ -24,9 +24,9 @@ from torchcrf_scan import (
 )
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 
 ASSOCIATION = (
     *("dist1", "dist3", "dist5", "angle1", "angle3", "angle5", "geo1", "geo3", "geo5"),
@@ -262,7 +262,7 @@ def test_saving_twice_keeps_the_last(tmp_path: Path) -> None:
 def test_an_unknown_name_lists_the_shipped_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("one", "other"):
         JointScanCRF().save_pretrained(tmp_path / "weights" / name)
-    monkeypatch.setattr("torchcrf_scan.model.files", lambda package: tmp_path)
+    monkeypatch.setattr("torchcrf_scan.pretrained.files", lambda package: tmp_path)
     with pytest.raises(ValueError, match=r"expected a folder with config\.json or one of one, other shipped models, got nowhere"):
         JointScanCRF.from_pretrained("nowhere")
     assert len(JointScanCRF.from_pretrained("other").state_dict()) > 30

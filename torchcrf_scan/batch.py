@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.scan import Floats, Scan, ScanPair
+from torchcrf_scan.scan import FARTHEST, Floats, Scan, ScanPair
 from torchcrf_scan.tree import tensor_tree
-
-if TYPE_CHECKING:
-    pass
 
 
 @tensor_tree
@@ -138,24 +134,38 @@ class ScanPairBatch:
 
     @classmethod
     def collate(cls, pairs: Sequence[ScanPair], dtype: torch.dtype = torch.float32) -> ScanPairBatch:
-        """Pads pairs into one batch (at least one, masked, point a scan). The truth is there when every pair is annotated."""
+        """Pads pairs into one batch (at least one, masked, point a scan). The truth is there when every pair is annotated.
+
+        Raises:
+            ValueError: no pairs, or a number that the dtype does not hold.
+        """
         if not pairs:
             raise ValueError("pairs: expected at least one pair, got none")
         source, source_mask = _pad_points([pair.source for pair in pairs])
         target, target_mask = _pad_points([pair.target for pair in pairs])
         return cls(
-            source=source.to(dtype),
-            target=target.to(dtype),
+            source=finite("source", source.to(dtype)),
+            target=finite("target", target.to(dtype)),
             source_mask=source_mask,
             target_mask=target_mask,
             source_closed=torch.tensor([pair.source.is_closed for pair in pairs]),
             target_closed=torch.tensor([pair.target.is_closed for pair in pairs]),
-            dt=torch.tensor([pair.dt for pair in pairs], dtype=dtype),
-            range_noise=torch.tensor([range_noise_of(pair) for pair in pairs], dtype=dtype),
-            initial_motion=torch.from_numpy(np.stack([initial_motion_of(pair) for pair in pairs])).to(dtype),
+            dt=finite("dt", torch.tensor([pair.dt for pair in pairs], dtype=dtype)),
+            range_noise=finite("range_noise", torch.tensor([range_noise_of(pair) for pair in pairs], dtype=dtype)),
+            initial_motion=finite(
+                "initial_motion", torch.from_numpy(np.stack([initial_motion_of(pair) for pair in pairs])).to(dtype)
+            ),
             target_origin=torch.zeros(len(pairs), 2, dtype=dtype),
             truth=_collate_truth(pairs, source_mask, dtype) if all(pair.annotation for pair in pairs) else None,
         )
+
+
+def finite(name: str, values: Tensor) -> Tensor:
+    """The values; ValueError where one is not finite, as what is too large for a dtype becomes."""
+    wrong = values[~torch.isfinite(values)]
+    if len(wrong):
+        raise ValueError(f"{name}: expected finite numbers of {values.dtype}, got {wrong[0].item()}")
+    return values
 
 
 def scale_motions(motions: Tensor, factor: Tensor) -> Tensor:
@@ -179,8 +189,8 @@ def initial_motion_of(pair: ScanPair) -> Floats:
     if pair.initial_motion is None:
         return np.zeros(3)
     guess = np.asarray(pair.initial_motion, dtype=np.float64)
-    if guess.shape != (3,) or not np.isfinite(guess).all():
-        raise ValueError(f"initial_motion: expected three finite numbers (theta, tx, ty), got {pair.initial_motion!r}")
+    if guess.shape != (3,) or not (np.abs(guess) <= FARTHEST).all():
+        raise ValueError(f"initial_motion: expected three finite numbers (theta, tx, ty) within {FARTHEST:g}, got {guess.tolist()}")
     return guess
 
 

@@ -1,18 +1,151 @@
-"""Checks of settings: every error names the setting, what was expected and what it got."""
+"""Checks of settings: every error names the setting, what was expected and what it got.
+
+A field of a dataclass of settings says in its annotation what it may be, e.g. `Annotated[int, Within(1, 100)]`; `check_fields`
+converts and checks them all where the dataclass is made, whoever makes it: a command, a file, or Python.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from numbers import Integral, Real
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+Settings = TypeVar("Settings")
+
+UNIONS = (Union, UnionType)
+SHOWN = 80  # letters of a wrong value that a message repeats
 
 
-def choose(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """Raises ValueError where a value is none of the choices."""
-    if value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value}")
+@dataclass(frozen=True, slots=True)
+class Within:
+    """A number may be from `least` to `most`; with `above` it must be more than `least`, with `below` less than `most`."""
+
+    least: float = -math.inf
+    most: float = math.inf
+    above: bool = False
+    below: bool = False
+
+    def allows(self, value: float) -> bool:
+        """Whether a number lies within; NaN never does."""
+        is_low = value > self.least if self.above else value >= self.least
+        return is_low and (value < self.most if self.below else value <= self.most)
+
+    def __str__(self) -> str:
+        if self.most == math.inf:
+            return f" above {self.least}" if self.above else f", {self.least} or more"
+        return f" in {'(' if self.above else '['}{self.least}, {self.most}{')' if self.below else ']'}"
 
 
-def within(name: str, value: float, least: float, most: float) -> None:
-    """Raises ValueError where a value is not in [least, most]."""
-    if not least <= value <= most:  # NaN is not
-        expected = f"{least} or more" if most == math.inf else f"a number in [{least}, {most:g}]"
-        raise ValueError(f"{name}: expected {expected}, got {value}")
+class OneOf:
+    """A text may be one of a few."""
+
+    def __init__(self, *choices: str) -> None:
+        self.choices = choices
+
+    def allows(self, value: str) -> bool:
+        """Whether it is one of them."""
+        return value in self.choices
+
+    def __str__(self) -> str:
+        return f": one of {', '.join(self.choices)}"
+
+
+Share = Annotated[float, Within(0, 1)]
+Amount = Annotated[float, Within(0)]
+Positive = Annotated[float, Within(0, above=True)]
+Seed = Annotated[int, Within(0, 2**31 - 1)]  # what every generator takes, a few more being added here and there
+
+
+def check_fields(settings: Any, prefix: str = "") -> None:
+    """Converts every field of a frozen dataclass to its type (2 to 2.0, a list to a tuple) and checks its bounds.
+
+    Args:
+        settings: what `__post_init__` is called with.
+        prefix: of the names in messages, e.g. `gradient.`.
+
+    Raises:
+        ValueError: a value of another type, not finite, or out of bounds.
+    """
+    kind: Any = type(settings)
+    for name, hint in _annotations(kind).items():
+        value = getattr(settings, name)
+        object.__setattr__(settings, name, _converted(f"{prefix}{name}", hint, value))
+
+
+def from_values(kind: Callable[..., Settings], values: object, name: str) -> Settings:
+    """Settings from what `asdict` made of them, as a file holds it; what is missing there has its default.
+
+    Raises:
+        ValueError: not a dictionary, a setting that there is not, or a value that `check_fields` refuses.
+    """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{name}: expected settings by name, got {_shown(values)}")
+    hints = _annotations(kind)
+    unknown = [str(key) for key in values if key not in hints]
+    if unknown:
+        raise ValueError(f"{name}: expected settings among {', '.join(hints)}, got {_shown(', '.join(unknown))}")
+    return kind(**{key: from_values(hints[key], of, key) if is_dataclass(hints[key]) else of for key, of in values.items()})
+
+
+@cache
+def _annotations(kind: Any) -> dict[str, Any]:
+    """The fields of a dataclass, with all that their annotations say."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def _converted(name: str, hint: Any, value: Any) -> Any:
+    """The value as the annotation has it."""
+    base, bounds = (hint.__origin__, hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
+    if not _suits(base, value):
+        raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
+    if get_origin(base) in UNIONS:
+        base = next(of for of in get_args(base) if _suits(of, value))
+    if get_origin(base) is tuple:
+        return tuple(_converted(name, get_args(base)[0], of) for of in value)
+    converted = base(value) if base in (bool, int, float) else value
+    if not all(bound.allows(converted) for bound in bounds):
+        raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
+    return converted
+
+
+def _suits(base: Any, value: Any) -> bool:
+    """Whether a value is of a type, or can be converted to it without loss; numbers must be finite."""
+    if get_origin(base) in UNIONS:
+        return any(_suits(of, value) for of in get_args(base))
+    if get_origin(base) is tuple:
+        return isinstance(value, list | tuple)
+    if base is bool or isinstance(value, bool):
+        return base is bool and isinstance(value, bool | np.bool_)
+    if base is float:
+        return isinstance(value, Real) and _is_finite(value)
+    return isinstance(value, Integral if base is int else base)
+
+
+def _is_finite(value: Real) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number that no float holds
+        return False
+
+
+def _description(hint: Any) -> str:
+    """What an annotation allows, in words."""
+    if get_origin(hint) is Annotated:
+        bounds = "".join(map(str, hint.__metadata__))
+        return bounds.removeprefix(": ") if hint.__origin__ is str else _description(hint.__origin__) + bounds
+    if get_origin(hint) in UNIONS:
+        return " or ".join(map(_description, get_args(hint)))
+    known = {int: "a whole number", float: "a finite number", bool: "true or false", str: "a text", type(None): "nothing"}
+    return known.get(hint, "a list" if get_origin(hint) is tuple else f"settings ({getattr(hint, '__name__', hint)})")
+
+
+def _shown(value: object) -> str:
+    text = value if isinstance(value, str) else repr(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."

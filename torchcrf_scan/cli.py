@@ -20,6 +20,7 @@ from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.commands.match import match
 from torchcrf_scan.commands.plot import plot
 from torchcrf_scan.commands.simulate import simulate
+from torchcrf_scan.data.formats import ENDINGS
 
 COMMANDS: Mapping[str, Callable[..., int]] = {
     "simulate": simulate,
@@ -31,9 +32,9 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
 }
 
 POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: what is given, how many (one where None), meaning
-    "files": ("PAIR.npz|LOG", "+", "pair files (.npz), folders of them, CARMEN logs (.log, .log.gz), or glob patterns"),
+    "files": ("PAIR.npz|LOG", "+", f"pair files (.npz), folders of them, logs ({ENDINGS}), or glob patterns"),
     "pair_files": ("PAIR.npz", "+", "pair files (.npz), folders of them, or glob patterns"),
-    "file": ("PAIR.npz|LOG", None, "a pair file (.npz), or with --number a CARMEN log (.log, .log.gz)"),
+    "file": ("PAIR.npz|LOG", None, f"a pair file (.npz), or with --number a log ({ENDINGS})"),
 }
 
 

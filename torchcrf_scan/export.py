@@ -23,9 +23,9 @@ from torch.overrides import TorchFunctionMode
 
 from torchcrf_scan.batch import ScanPairBatch, scale_motions
 from torchcrf_scan.config import ModelConfig
-from torchcrf_scan.inference import joint
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.variants import sweep
 
 OPSET = 18  # of ONNX
 FROM_BATCH = (
@@ -100,7 +100,7 @@ class UnrolledDecoder(nn.Module):
     def _answers(self, batch: ScanPairBatch, start: Start) -> dict[str, Tensor]:
         view = self.model.view(batch, self.model.learned_inputs(batch, start))
         fitted = self.model.fitted
-        state = joint.settle(view, start.scaled(view.factor), fitted, self.model.config).state
+        state = sweep.settle(view, start.scaled(view.factor), fitted, self.model.config).state
         association_confidence, cluster_confidence = fitted.calibration(state)
         return {
             "association": state.association,
@@ -117,8 +117,7 @@ class UnrolledDecoder(nn.Module):
 
 def unrolled_config(config: ModelConfig, iterations: int | None = None) -> ModelConfig:
     """The settings with a fixed number of rounds (None: as many as there may be) on tensors."""
-    if config.inference.schedule != "sweep":
-        raise ValueError(f"schedule: expected sweep for a model to export, got {config.inference.schedule}")
+    config.require("is_exportable", "for a model to export")
     rounds = config.inference.iterations if iterations is None else iterations
     return replace(config, inference=replace(config.inference, backend="eager", stop_early=False, iterations=rounds))
 

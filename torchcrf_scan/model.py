@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,48 +11,45 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchcrf_scan.batch import ScanPairBatch, scale_motions
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.choices import STARTS
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.encoder.encoder import ScanEncoder
+from torchcrf_scan.fast.arrays import fitted_of, settings_of
 from torchcrf_scan.fast.choice import can_decode
-from torchcrf_scan.fast.decode import learned_of, settings_of
 from torchcrf_scan.fast.pairs import by_beam, decode_pairs, extras_of, predict
 from torchcrf_scan.features.learned import EMBEDDING_WEIGHTS, Embeddings, ExtraLogUnary, LearnedInputs
 from torchcrf_scan.features.potentials import Boosters, PairView
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales, has_weight, live_weights
-from torchcrf_scan.inference import joint, pseudo_likelihood
-from torchcrf_scan.inference.selection import ClusterPotential
+from torchcrf_scan.features.scales import Scales, has_weight, live_weights
+from torchcrf_scan.inference import pseudo_likelihood
 from torchcrf_scan.inference.start import Start
-from torchcrf_scan.inference.state import Parameters
+from torchcrf_scan.inference.state import ClusterPotential, Parameters
 from torchcrf_scan.inference.uncertainty import Calibration
 from torchcrf_scan.loops.pair import pair_of_scans
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.prediction import Prediction
-from torchcrf_scan.pretrained import PRETRAINED, find_weights, model_config
+from torchcrf_scan.pretrained import PRETRAINED, find_weights, load_state, read_config, write_model
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 from torchcrf_scan.search.accept import score_of
 from torchcrf_scan.search.pairs import initialise, start_pairs
 from torchcrf_scan.search.score import HypothesisScore
-from torchcrf_scan.variants import flooding, lattice_likelihood
-from torchcrf_scan.variants.paper_start import paper_start
-from torchcrf_scan.variants.points_start import points_start
+from torchcrf_scan.variants.register import BEGINNINGS, DECODERS, LIKELIHOODS
+
+BothEmbeddings = tuple[Tensor | None, Tensor | None]  # of source and target
 
 
 class JointScanCRF(nn.Module):
-    """Joint association, clustering and motion of B scan pairs.
+    """Data association, clustering and motions of B scan pairs by a log-linear conditional random field.
 
-    Named weights: the paper's thirty, 18 of the association chain and 12 of the clustering chain (spec 5.1), and those of the
-    extensions that are on (`FeatureConfig`). The boosters, the features' scales and the score of the start's hypotheses are
-    buffers, fitted before the weights (`torchcrf_scan.learning`).
+    Parameters: one named weight a feature. The paper has thirty, 18 of the association chain and 12 of the clustering chain
+    (spec 5.1); extensions that are on (`FeatureConfig`) and embeddings (`features.learned`) add theirs. Buffers: boosters, scales
+    of the features and the score of hypothesised movers, which are fitted before the weights (`torchcrf_scan.learning`); with
+    `features.learn_stumps` the boosters are parameters. With `encoder` a `ScanEncoder` adds log potentials and embeddings.
 
-    Gradients reach the weights, the points and what `forward` is given beside them through log-beliefs and, with
-    `inference.motion_weights = soft`, through the motions, at fixed candidates and away from kinks (ties, capped errors). Without
-    gradient: the labels, the start, the choice of candidates, the unit of length, what beams measured, and the boosted scores,
-    which are steps unless `features.smooth` is above 0. The `flooding` schedule has no gradient at all and fits its motions by
-    Eq. 6 on hard labels whatever `motion_metric` and `motion_weights` say.
-
-    With `features.embedding` there are two weights more in `association_weights`, `embedding` and `embedding_data` (see
-    `features.learned`), and with `features.learn_stumps` the boosters are parameters. With `encoder` there is a `ScanEncoder`,
-    asked once, under the motions of the start; what it says is added to what `forward` is given.
+    Gradients: log-beliefs are differentiable in the weights, the points and the optional inputs of `forward`, and so are the
+    motions with `inference.motion_weights = soft`; at fixed candidates and away from kinks (ties, clipped errors). Labels, start,
+    candidates, unit of length, free space and boosted scores (steps unless `features.smooth` is above 0) have none. The schedule
+    `flooding` has no gradient and fits its motions by Eq. 6 on hard labels, whatever the metric and the weights.
     """
 
     association_weights: nn.ParameterDict
@@ -127,31 +122,30 @@ class JointScanCRF(nn.Module):
         target_embedding: Tensor | None = None,
         extra_log_unary: ExtraLogUnary | None = None,
     ) -> LearnedInputs | None:
-        """The optional inputs of `forward`, checked, with what the encoder says of the batch; None where there are none.
+        """The optional inputs of `forward`, checked, with the output of the encoder; None where there are none.
 
-        start: motions that the encoder is to see the batch under; None: it is not asked.
+        start: motions under which the encoder sees the batch; None: without the encoder.
         """
-        extra = extra_log_unary or ExtraLogUnary()
+        extra, embeddings = extra_log_unary or ExtraLogUnary(), (source_embedding, target_embedding)
         if self.encoder is not None and start is not None:
-            encoded = self.encoder(batch, start, self.config.inference.backend)
-            extra = extra.plus(encoded.extra)
-            if encoded.source_embedding is not None:
-                if source_embedding is not None or target_embedding is not None:
-                    raise ValueError("source_embedding: expected none for a model whose encoder makes embeddings, got one")
-                source_embedding, target_embedding = encoded.source_embedding, encoded.target_embedding
-        given = {"source_embedding": source_embedding, "target_embedding": target_embedding}
-        given |= {"extra_log_unary.outlier": extra.outlier, "extra_log_unary.moving": extra.moving}
-        if all(value is None for value in given.values()):
+            extra, embeddings = self._with_encoder(self.encoder, batch, start, extra, embeddings)
+        if all(value is None for value in (*embeddings, extra.outlier, extra.moving)):
             return None
-        if self.config.inference.schedule == "flooding":
-            raise ValueError("schedule: expected sweep with embeddings or extra_log_unary, got flooding")
-        for name, value in given.items():
-            points = batch.target_mask if name == "target_embedding" else batch.source_mask
-            wanted = (*points.shape, "C") if name.endswith("embedding") else tuple(points.shape)
-            if value is not None and (value.dim() != len(wanted) or value.shape[:2] != points.shape):
-                raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
+        self.config.require("takes_extras", "with embeddings or extra_log_unary")
+        check_inputs(batch, extra, embeddings)
         outlier, moving = (None if of is None else torch.where(batch.source_mask, of, 0.0) for of in (extra.outlier, extra.moving))
-        return LearnedInputs(self._embeddings(batch, source_embedding, target_embedding), outlier, moving)
+        return LearnedInputs(self._embeddings(batch, *embeddings), outlier, moving)
+
+    def _with_encoder(
+        self, encoder: ScanEncoder, batch: ScanPairBatch, start: Start, extra: ExtraLogUnary, embeddings: BothEmbeddings
+    ) -> tuple[ExtraLogUnary, BothEmbeddings]:
+        """The inputs with the output of the encoder."""
+        encoded = encoder(batch, start, self.config.inference.backend)
+        if encoded.source_embedding is None:
+            return extra.plus(encoded.extra), embeddings
+        if any(of is not None for of in embeddings):
+            raise ValueError("source_embedding: expected none for a model whose encoder makes embeddings, got one")
+        return extra.plus(encoded.extra), (encoded.source_embedding, encoded.target_embedding)
 
     def _embeddings(self, batch: ScanPairBatch, source: Tensor | None, target: Tensor | None) -> Embeddings | None:
         if source is None and target is None:
@@ -167,18 +161,13 @@ class JointScanCRF(nn.Module):
 
     def initialise(self, batch: ScanPairBatch) -> Start:
         """InitialiseRT: the motions to begin with (Algorithm 1, line 1). No gradient."""
-        found = initialise(batch, score_of(self.hypothesis_score), self._clusters)
-        if self.config.start == "search":
+        found = initialise(batch, score_of(self.hypothesis_score), self.config.motions)
+        begin = BEGINNINGS.get(self.config.start)
+        if begin is None:
             return found
-        look = {"paper": paper_start, "points": points_start}[self.config.start]
         with torch.autocast(batch.source.device.type, enabled=False):  # a few centimetres decide which movers there are
             view = self.view(batch)
-            return look(view, found.scaled(view.factor), self.fitted, self.config.inference).scaled(1 / view.factor)
-
-    @property
-    def _clusters(self) -> int:
-        """C: motions of background and movers."""
-        return 1 if self.config.chains == "matching" else self.config.inference.clusters - 1
+            return begin(view, found.scaled(view.factor), self.fitted, self.config.inference).scaled(1 / view.factor)
 
     def forward(
         self,
@@ -198,14 +187,14 @@ class JointScanCRF(nn.Module):
                 ones are associated. The start is looked for without them. None: as if the model knew none.
             extra_log_unary: (B, N) learned log potentials of outliers and of moving points.
         """
-        start = start or self.initialise(batch)
-        learned = self.learned_inputs(
+        start = start or self.initialise(batch)  # InitialiseRT
+        learned = self.learned_inputs(  # of the encoder and of the caller
             batch, start, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
         )
-        decode = self._in_loops if self._needs_no_tensors(batch, learned) else self._in_tensors
-        return decode(batch, start, learned)
+        rounds = self._in_loops if self._suits_loops(batch, learned) else self._in_tensors  # the engine
+        return rounds(batch, start, learned)  # potentials, messages, motions, again until they settle
 
-    def _needs_no_tensors(self, batch: ScanPairBatch, learned: LearnedInputs | None) -> bool:
+    def _suits_loops(self, batch: ScanPairBatch, learned: LearnedInputs | None) -> bool:
         """Whether the loops answer: on a CPU, for settings that they know, where there is no gradient to follow."""
         extra = () if learned is None else (learned.outlier, learned.moving)
         tensors = (*self.parameters(), batch.source, batch.target, batch.initial_motion, *extra)
@@ -214,14 +203,15 @@ class JointScanCRF(nn.Module):
         return can_decode(self.config, batch.source.device, needs_gradient=needs_gradient, has_embeddings=has_embeddings)
 
     def _in_loops(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
-        return predict(batch, start, learned_of(self.fitted), settings_of(self.config), learned)
+        """The rounds in machine code, one pair a thread, without a gradient."""
+        return predict(batch, start, fitted_of(self.fitted), settings_of(self.config), learned)
 
     def _in_tensors(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
-        view = self.view(batch, learned)
-        schedule = {"sweep": joint.decode, "flooding": flooding.decode}[self.config.inference.schedule]
-        prediction = schedule(view, start.scaled(view.factor), self.fitted, self.config)
-        uncertainty = prediction.uncertainty and prediction.uncertainty.scaled(1 / view.factor)
-        return replace(prediction, motions=scale_motions(prediction.motions, 1 / view.factor), uncertainty=uncertainty)
+        """The same in tensors, all pairs at once, with a gradient where the schedule has one."""
+        view = self.view(batch, learned)  # features, in their unit of length
+        decode = DECODERS[self.config.inference.schedule]
+        found = decode(view, start.scaled(view.factor), self.fitted, self.config)
+        return found.scaled(1 / view.factor)  # metres
 
     def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
         """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.
@@ -232,11 +222,9 @@ class JointScanCRF(nn.Module):
             raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
         view = self.view(batch)
         plugins = plugins or pseudo_likelihood.true_plugins(view.batch, self.config.inference.clusters - 1)
-        if self.config.chains == "matching":
+        if not self.config.has_clusters:
             plugins = pseudo_likelihood.for_background_alone(plugins)
-        if self.config.coupling == "lattice":
-            return lattice_likelihood.pseudo_log_likelihood(view, plugins, self.fitted, self.config.inference)
-        return pseudo_likelihood.pseudo_log_likelihood(view, plugins, self.fitted, self.config)
+        return LIKELIHOODS[self.config.coupling](view, plugins, self.fitted, self.config)
 
     @torch.no_grad()
     def match(
@@ -262,31 +250,20 @@ class JointScanCRF(nn.Module):
         """The answers for one batch of pairs: in arrays all the way where the loops answer, in padded tensors elsewhere."""
         reference = self.association_weights["sequence"]
         has_embeddings = self.config.encoder.embedding > 0
-        if self.config.start != "search" or not can_decode(self.config, reference.device, has_embeddings=has_embeddings):
+        if not (STARTS[self.config.start].in_loops and can_decode(self.config, reference.device, has_embeddings=has_embeddings)):
             prediction = self(ScanPairBatch.collate(pairs, reference.dtype).without_truth().to(reference.device))
             return [prediction.pair(b, pair) for b, pair in enumerate(pairs)]
         scans = [pair_of_scans(pair, reference.dtype) for pair in pairs]
-        starts = start_pairs(scans, score_of(self.hypothesis_score), self._clusters)
+        starts = start_pairs(scans, score_of(self.hypothesis_score), self.config.motions)
         extras = extras_of(
             [len(pair.source) for pair in scans], None if self.encoder is None else self.encoder.of_pairs(scans, starts)
         )
-        answers = decode_pairs(scans, starts, extras, learned_of(self.fitted), settings_of(self.config))
+        answers = decode_pairs(scans, starts, extras, fitted_of(self.fitted), settings_of(self.config))
         return [by_beam(answer, pair) for answer, pair in zip(answers, pairs, strict=True)]
 
     def save_pretrained(self, folder: str | Path) -> None:
-        """Writes `config.json` and `model.safetensors` into a folder, each whole or not at all."""
-        from safetensors.torch import save
-
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        contents = {
-            "config.json": (json.dumps(asdict(self.config), indent=2) + "\n").encode(),
-            "model.safetensors": save({name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}),
-        }
-        for name, content in contents.items():
-            temporary = folder / f".{name}.{os.getpid()}"
-            temporary.write_bytes(content)
-            os.replace(temporary, folder / name)
+        """Writes `config.json` and `model.safetensors` into a folder, see `pretrained`."""
+        write_model(Path(folder), self.config, self.state_dict())
 
     @classmethod
     def from_pretrained(
@@ -298,25 +275,31 @@ class JointScanCRF(nn.Module):
             name_or_path: a folder, or a name under `torchcrf_scan/weights`.
             features: `smooth`, `learn_stumps` or `embedding` of `FeatureConfig` to change; weights that the saved model has not
                 begin as in a new one.
-            inference: fields of `InferenceConfig` to change, e.g. `candidates=0`.
-        """
-        from safetensors.torch import load
+            inference: fields of `InferenceConfig` to change, e.g. `candidates=0`, `backend="eager"`.
 
+        Raises:
+            ValueError: no such model, a damaged one, weights that are not finite, or a value that is out of bounds.
+        """
         folder = find_weights(name_or_path)
-        config = model_config(json.loads((folder / "config.json").read_text()))
-        if inference:
-            config = replace(config, inference=replace(config.inference, **inference))
-        if features:
-            config = replace(config, features=replace(config.features, **features))
-        model = cls(config)
-        saved = load((folder / "model.safetensors").read_bytes())
-        model.load_state_dict({**model.embedding_state, **saved} if features else saved)
+        model = cls(read_config(folder, features or {}, inference))
+        load_state(model, folder, model.embedding_state if features else {})
         return model.eval()
 
     @property
     def embedding_state(self) -> dict[str, Tensor]:
         """The part of the model's state that another without embeddings has not."""
         return {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in EMBEDDING_WEIGHTS}
+
+
+def check_inputs(batch: ScanPairBatch, extra: ExtraLogUnary, embeddings: BothEmbeddings) -> None:
+    """Raises ValueError where an optional input of `forward` has another shape than the batch."""
+    given = {"source_embedding": embeddings[0], "target_embedding": embeddings[1]}
+    given |= {"extra_log_unary.outlier": extra.outlier, "extra_log_unary.moving": extra.moving}
+    for name, value in given.items():
+        points = batch.target_mask if name == "target_embedding" else batch.source_mask
+        wanted = (*points.shape, "C") if name.endswith("embedding") else tuple(points.shape)
+        if value is not None and (value.dim() != len(wanted) or value.shape[:2] != points.shape):
+            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
 
 
 class MatchingCRF(JointScanCRF):

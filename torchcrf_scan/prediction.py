@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcrf_scan.batch import scale_motions
 from torchcrf_scan.scan import Floats, Ints, PairPrediction, ScanPair
 from torchcrf_scan.tree import tensor_tree
 
@@ -112,6 +113,11 @@ class Prediction:
     association_confidence: Tensor | None = None
     cluster_confidence: Tensor | None = None
     uncertainty: Uncertainty | None = None
+
+    def scaled(self, factor: Tensor) -> Prediction:
+        """The same in another unit of length, a factor (B,) a pair."""
+        uncertainty = self.uncertainty and self.uncertainty.scaled(factor)
+        return replace(self, motions=scale_motions(self.motions, factor), uncertainty=uncertainty)
 
     def pair(self, b: int, pair: ScanPair) -> PairPrediction:
         """Pair b by beam, its movers numbered 1.. by falling size, the vacuous ones left out."""

@@ -1,40 +1,104 @@
-"""."""
+"""Saved models: a folder of `config.json` and `model.safetensors`, or a name of those that the package ships."""
 
 from __future__ import annotations
 
+import json
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from torchcrf_scan.config import EncoderConfig, FeatureConfig, InferenceConfig, ModelConfig
+import torch
+from torch import Tensor, nn
+
+from torchcrf_scan.checks import from_values
+from torchcrf_scan.config import RUN_TIME, InferenceConfig, ModelConfig
+from torchcrf_scan.whole_file import write_whole
 
 PRETRAINED = "simulated"
-
-
-def model_config(values: dict[str, Any]) -> ModelConfig:
-    """The config that `asdict` made into a dictionary."""
-    return ModelConfig(
-        **{k: v for k, v in values.items() if k not in ("features", "inference", "encoder")},
-        features=FeatureConfig(**{**values["features"], "left_out": tuple(values["features"].get("left_out", ()))}),
-        inference=InferenceConfig(**values["inference"]),
-        encoder=encoder_config(values.get("encoder", {})),
-    )
-
-
-def encoder_config(values: dict[str, Any]) -> EncoderConfig:
-    """The config that `asdict` made into a dictionary; none of models that were saved before there were encoders."""
-    return EncoderConfig(**{**values, "dilations": tuple(values["dilations"])}) if values else EncoderConfig()
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+PADDED = "thresholds"  # the last part of the names of tensors that are padded with infinity
 
 
 def find_weights(name_or_path: str | Path) -> Path:
     """The folder of a saved model: a path, or the name of one that the package ships."""
     path = Path(name_or_path)
-    if (path / "config.json").is_file():
+    if (path / CONFIG).is_file():
         return path
     shipped = Path(str(files("torchcrf_scan") / "weights"))
-    if (shipped / str(name_or_path) / "config.json").is_file():
+    if (shipped / str(name_or_path) / CONFIG).is_file():
         return shipped / str(name_or_path)
     names = sorted(entry.name for entry in shipped.iterdir()) if shipped.is_dir() else []
     raise ValueError(
         f"name_or_path: expected a folder with config.json or one of {', '.join(names) or 'no'} shipped models, got {path}"
     )
+
+
+def write_model(folder: Path, config: ModelConfig, state: Mapping[str, Tensor]) -> None:
+    """Writes a model, each file whole or not at all; what is run-time only (`config.RUN_TIME`) is not written."""
+    from safetensors.torch import save
+
+    values = asdict(config)
+    for name in RUN_TIME:
+        del values["inference"][name]
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / CONFIG, json.dumps(values, indent=2) + "\n")
+    write_whole(folder / WEIGHTS, save({name: value.detach().cpu().contiguous() for name, value in state.items()}))
+
+
+def read_config(folder: Path, features: Mapping[str, Any], inference: Mapping[str, Any]) -> ModelConfig:
+    """The config of a saved model with some fields changed.
+
+    Raises:
+        ValueError: a file that is no config, or a value that is refused.
+    """
+    path = folder / CONFIG
+    try:
+        config = model_config(json.loads(path.read_text()))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    return replace(config, inference=replace(config.inference, **inference), features=replace(config.features, **features))
+
+
+def model_config(values: Any) -> ModelConfig:
+    """The config that `asdict` made into a dictionary, with the defaults of the time when there was less to say."""
+    if isinstance(values, dict):
+        values = {name: dict(of) if isinstance(of, dict) else of for name, of in values.items()}
+        if isinstance(values.get("inference"), dict):
+            _drop_run_time(values["inference"])
+        if isinstance(values.get("features"), dict):
+            values["features"].setdefault("left_out", ())  # models that are older than this setting have every feature
+    return from_values(ModelConfig, values, "model")
+
+
+def _drop_run_time(inference: dict[str, Any]) -> None:
+    """Takes out what was once saved with the weights; a value that is not the default is told."""
+    defaults = {field.name: field.default for field in fields(InferenceConfig)}
+    for name in RUN_TIME:
+        value = inference.pop(name, defaults[name])
+        if value != defaults[name]:
+            told = f"inference.{name} = {value} is not read from saved models, {defaults[name]} is used: give it when loading"
+            warnings.warn(told, stacklevel=2)
+
+
+def load_state(model: nn.Module, folder: Path, fresh: Mapping[str, Tensor]) -> None:
+    """Takes over the saved tensors; those of `fresh` that were not saved stay as they are.
+
+    Raises:
+        ValueError: a file that is none, one of another model, or numbers that are not finite.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    path = folder / WEIGHTS
+    try:
+        saved = load(path.read_bytes())
+        model.load_state_dict({**fresh, **saved})
+    except (SafetensorError, RuntimeError) as error:
+        raise ValueError(f"{path}: expected the tensors of the model that {CONFIG} describes, got {error}") from error
+    for name, value in saved.items():
+        is_right = ~torch.isnan(value) if name.endswith(PADDED) else torch.isfinite(value)
+        if not is_right.all():
+            raise ValueError(f"{path}: {name}: expected finite numbers, got {value[~is_right][0]}")

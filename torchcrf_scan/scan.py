@@ -22,6 +22,7 @@ Bools = NDArray[np.bool_]
 BACKGROUND = 0
 OUTLIER = -1
 MAX_RANGE_MARGIN = 0.05  # spec 0.2: a return this close to range_max is a beam that hit nothing
+FARTHEST = 1e6  # metres; what a sensor calls farther is no return, and its square would leave single precision
 CLOSED_SPAN = float(np.radians(315.0))  # a scan that sees this much of the circle has neighbours across +-180 deg (A-06)
 
 
@@ -31,6 +32,17 @@ def _vector(name: str, values: ArrayLike, length: int | None = None) -> Floats:
         expected = "(N,)" if length is None else f"({length},)"
         raise ValueError(f"{name}: expected shape {expected}, got {array.shape}")
     return array
+
+
+def check_sensor(range_min: float | None, range_max: float | None, range_noise: float | None) -> None:
+    """Raises ValueError where what is told of a sensor cannot be: not a number, nothing between its limits, a senseless noise."""
+    least = 0.0 if range_min is None else range_min
+    if not np.isfinite(least):
+        raise ValueError(f"range_min: expected a finite number of metres, got {range_min}")
+    if range_max is not None and not range_max > max(least, 0.0):
+        raise ValueError(f"range_max: expected more than range_min = {max(least, 0.0)}, got {range_max}")
+    if range_noise is not None and not 0 <= range_noise <= FARTHEST:
+        raise ValueError(f"range_noise: expected metres between 0 and {FARTHEST:g}, got {range_noise}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,17 +79,21 @@ class Scan:
     ) -> Scan:
         """Makes a scan from ranges and bearings, or from ranges, `angle_min` and `angle_increment`.
 
-        Invalid returns (not finite, not above max(range_min, 0), not below range_max - 0.05 m) are dropped.
+        Invalid returns (not finite, not above max(range_min, 0), not below range_max - 0.05 m nor `FARTHEST`) are dropped. A
+        range_max of infinity is no limit.
 
         Raises:
-            ValueError: wrong shapes, neither or both forms of bearings, bearings not finite or decreasing.
+            ValueError: wrong shapes, neither or both forms of bearings, bearings not finite or decreasing, a sensor that cannot be.
         """
         ranges = _vector("ranges", ranges)
+        check_sensor(range_min, range_max, range_noise)
         steps = [value for value in (angle_min, angle_increment) if value is not None]
         if len(steps) != (2 if bearings is None else 0):
             raise ValueError("bearings: expected either bearings or both angle_min and angle_increment, got neither, half or both")
         if bearings is None:
             first, increment = steps
+            if increment == 0 and len(ranges) > 1:
+                raise ValueError("angle_increment: expected more than 0, got 0")
             bearings = first + increment * np.arange(len(ranges))
         bearings = _vector("bearings", bearings, len(ranges))
         if not np.isfinite(bearings).all():
@@ -86,7 +102,7 @@ class Scan:
         if len(back):
             raise ValueError(f"bearings: expected counter-clockwise (non-decreasing), got a step back after beam {back[0]}")
         with np.errstate(invalid="ignore"):
-            valid = np.isfinite(ranges) & (ranges > max(range_min or 0.0, 0.0))
+            valid = (ranges < FARTHEST) & (ranges > max(range_min or 0.0, 0.0))
             if range_max is not None:
                 valid &= ranges < range_max - MAX_RANGE_MARGIN
         beam = np.flatnonzero(valid)

@@ -11,8 +11,9 @@ import pytest
 from checks import check
 from rooms import AWKWARD, room_pair
 
-from torchcrf_scan.baselines import libraries
-from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries, match_small_gicp, planar_motion
+from torchcrf_scan.baselines import register
+from torchcrf_scan.baselines.libraries import match_open3d, match_small_gicp, planar_motion
+from torchcrf_scan.baselines.register import BASELINES, can_import, installed
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
@@ -26,12 +27,12 @@ def transform(motion: np.ndarray) -> np.ndarray:
     return T
 
 
-@pytest.fixture(params=LIBRARIES)
+@pytest.fixture(params=[("small_gicp", match_small_gicp), ("open3d", match_open3d)], ids=lambda of: of[0])
 def method(request: pytest.FixtureRequest) -> Callable[[ScanPair], PairPrediction]:
-    module = LIBRARIES[request.param][0]
-    if request.param not in installed_libraries():
+    module, match = request.param
+    if not can_import(module):
         pytest.skip(f"needs {module}: pip install torchcrf-scan[bench]")
-    return LIBRARIES[request.param][1]
+    return match
 
 
 def test_a_small_motion_is_recovered(method: Callable[[ScanPair], PairPrediction]) -> None:
@@ -58,8 +59,8 @@ def test_only_what_can_be_imported_is_offered(monkeypatch: pytest.MonkeyPatch) -
         if module != "small_gicp":
             raise ModuleNotFoundError(module)
 
-    monkeypatch.setattr(libraries, "import_module", find)
-    assert installed_libraries() == {"small_gicp (ICP)": match_small_gicp}
+    monkeypatch.setattr(register, "import_module", find)
+    assert set(BASELINES) - set(installed()) == {"Open3D (ICP)"}
 
 
 def test_the_clouds_and_the_motion_go_the_right_way(monkeypatch: pytest.MonkeyPatch) -> None:

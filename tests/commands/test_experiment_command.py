@@ -12,9 +12,10 @@ from command_line import fail, run
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
+from torchcrf_scan.baselines.register import BASELINES, installed
 from torchcrf_scan.experiment import cross_validation, experiment
-from torchcrf_scan.experiment.methods import ENCODED, EXACT, JOINT, LATTICE, LATTICE_EXACT, METHODS
+from torchcrf_scan.experiment.methods import METHODS
+from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT, LATTICE, LATTICE_EXACT
 
 PROTOCOLS = ("leave_one_pair_out", "leave_one_sequence_out")
 TABLES = {PROTOCOLS[0]: 6, PROTOCOLS[1]: 7}  # overview, I to III, how sure, differences; and those of the exact model
@@ -47,7 +48,7 @@ def done(pairs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
 
 def test_every_method_is_in_every_table(done: tuple[Path, str]) -> None:
     folder, printed = done
-    absent = {ENCODED, *LIBRARIES} - {*installed_libraries()}
+    absent = {ENCODED, *BASELINES} - {*installed()}
     for protocol in PROTOCOLS:
         text = (folder / "tables" / f"{protocol}.md").read_text()
         assert text.strip().split("\n\n")[-1] in printed

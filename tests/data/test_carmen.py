@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchcrf_scan.data.carmen import CarmenLog, bearings_of, is_log, log_name
+from torchcrf_scan.data.carmen import CarmenLog, bearings_of, log_name
 
 LOGS = Path(__file__).resolve().parents[3] / "shared" / "data" / "logs"
 
@@ -50,11 +50,10 @@ def test_pairs_of_consecutive_readings(path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("file", "name"),
-    [("run.log", "run"), ("run.log.gz", "run"), ("2003.10.12.log", "2003.10.12"), ("log.npz", None), ("a.gz", None)],
+    [("run.log", "run"), ("run.log.gz", "run"), ("2003.10.12.log", "2003.10.12")],
 )
-def test_logs_are_told_by_their_names(file: str, name: str | None) -> None:
-    assert is_log(Path("folder.log") / file) == (name is not None)
-    assert name is None or log_name(Path("folder.log") / file) == name
+def test_a_log_is_named_like_its_file(file: str, name: str) -> None:
+    assert log_name(Path("folder.log") / file) == name
 
 
 @pytest.mark.parametrize(("count", "last"), [(180, 89.0), (181, 90.0), (360, 89.5), (361, 90.0), (1, -90.0)])

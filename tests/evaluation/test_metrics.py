@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_pairs import make_pair, make_prediction, make_small, perfect, perturbed, random_labels, truth_of
 
-from torchcrf_scan.counterparts import match_movers, relabel
+from torchcrf_scan.evaluation.counterparts import match_movers, relabel
 from torchcrf_scan.evaluation.metrics import edit_distance, score_pair
 from torchcrf_scan.scan import ScanPair
 

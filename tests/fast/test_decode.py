@@ -16,7 +16,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.fast import decode
+from torchcrf_scan.fast import arrays, decode
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.loops.pair import pair_of
 from torchcrf_scan.prediction import Prediction
@@ -53,11 +53,11 @@ def simulated(seed: int, fov: float = 180.0) -> ScanPairBatch:
     return ScanPairBatch.collate([pair], torch.float64).without_truth()
 
 
-def compiled(model: JointScanCRF, batch: ScanPairBatch, start: Start) -> decode.Decoded:
+def compiled(model: JointScanCRF, batch: ScanPairBatch, start: Start) -> arrays.Decoded:
     pair = pair_of(batch, 0)
     none = np.zeros(len(pair.source))
     return decode.decode_pair(
-        pair, start_arrays(start, 0, pair), none, none, decode.learned_of(model.fitted), decode.settings_of(model.config)
+        pair, start_arrays(start, 0, pair), none, none, arrays.fitted_of(model.fitted), arrays.settings_of(model.config)
     )
 
 
@@ -81,7 +81,7 @@ def place_of(labels: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     return np.where(is_there.any(1), is_there.argmax(1), -1)
 
 
-def assert_same_labels(found: decode.Decoded, expected: Prediction) -> np.ndarray:
+def assert_same_labels(found: arrays.Decoded, expected: Prediction) -> np.ndarray:
     """Labels may differ where two are equally likely to rounding; returns (N,) where both chains' are the same."""
     candidates, outlier = expected.candidates[0].numpy(), expected.log_cluster.shape[-1] - 1
     association, cluster = expected.association[0].numpy(), expected.cluster[0].numpy()
@@ -102,7 +102,7 @@ def assert_same_labels(found: decode.Decoded, expected: Prediction) -> np.ndarra
     return agree
 
 
-def assert_same_answer(found: decode.Decoded, expected: Prediction) -> None:
+def assert_same_answer(found: arrays.Decoded, expected: Prediction) -> None:
     """Labels but for ties; everything else of the points whose labels agree, and of the clusters that lose and gain none."""
     agree = assert_same_labels(found, expected)
     touched = np.concatenate([found.cluster[~agree], expected.cluster[0].numpy()[~agree]])
@@ -188,7 +188,7 @@ def test_nothing_that_is_given_changes() -> None:
     pair, start = pair_of(batch, 0), layer().initialise(batch)
     first, extra = start_arrays(start, 0, pair), (0.1 * normal(2, len(pair.source), seed=1)).numpy()
     given = [np.copy(values) for values in (*first, *extra, pair.source, pair.target)]
-    learned, settings = decode.learned_of(layer().fitted), decode.settings_of(layer().config)
+    learned, settings = arrays.fitted_of(layer().fitted), arrays.settings_of(layer().config)
     once, twice = (decode.decode_pair(pair, first, *extra, learned, settings) for _ in range(2))
     for before, after in zip(given, (*first, *extra, pair.source, pair.target), strict=True):
         np.testing.assert_array_equal(before, after)
@@ -196,7 +196,7 @@ def test_nothing_that_is_given_changes() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def altered(decoded: decode.Decoded, **values: Any) -> decode.Decoded:
+def altered(decoded: arrays.Decoded, **values: Any) -> arrays.Decoded:
     """A copy that differs at point 0, or of cluster 0."""
     for name, value in values.items():
         changed = getattr(decoded, name).copy()

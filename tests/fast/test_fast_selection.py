@@ -13,7 +13,7 @@ from torchcrf_scan import JointScanCRF
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.fast import decode, selection
+from torchcrf_scan.fast import arrays, decode, selection
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.inference import selection as eager
 from torchcrf_scan.inference.joint import first_state
@@ -50,7 +50,7 @@ def array(values: Tensor) -> Any:
 def test_evidence_and_choice_agree_with_the_eager_ones(seed: int, odds: float) -> None:
     batch, view, start, state = considered(seed)
     fitted, config = layer().fitted, layer().config
-    learned, settings = decode.learned_of(fitted), decode.settings_of(config)
+    learned, settings = arrays.fitted_of(fitted), arrays.settings_of(config)
     pair = pair_of(batch, 0)
     begin, none = start_arrays(start, 0, pair), np.zeros(len(pair.source))
     scene = decode.scene_of(pair, begin, none, none, settings)
@@ -69,7 +69,7 @@ def test_evidence_and_choice_agree_with_the_eager_ones(seed: int, odds: float) -
 
 def test_the_background_alone_is_never_asked() -> None:
     batch, _, start, _ = considered(0)
-    learned, settings = decode.learned_of(layer().fitted), decode.settings_of(layer().config)
+    learned, settings = arrays.fitted_of(layer().fitted), arrays.settings_of(layer().config)
     pair = pair_of(batch, 0)
     begin, none = start_arrays(start, 0, pair), np.zeros(len(pair.source))
     scene = decode.scene_of(pair, begin, none, none, settings)

@@ -16,9 +16,10 @@ from torchcrf_scan.features.association import (
     shape_features,
 )
 from torchcrf_scan.features.candidates import by_motion, every_target
-from torchcrf_scan.features.scales import SHAPE_CHANNELS, Scales, robust_square
+from torchcrf_scan.features.scales import Scales, robust_square
 from torchcrf_scan.features.shape import describe
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.names import SHAPE_CHANNELS
 
 SEEDS = st.integers(0, 10_000)
 LENGTHS = st.integers(1, 7)

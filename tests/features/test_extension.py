@@ -24,8 +24,9 @@ from torchcrf_scan.features.potentials import (
     clustering_unary,
     find_candidates,
 )
-from torchcrf_scan.features.scales import ASSOCIATION_UNARY, ASSOCIATION_WEIGHTS, CLUSTERING_UNARY, CLUSTERING_WEIGHTS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.names import ASSOCIATION_UNARY, ASSOCIATION_WEIGHTS, CLUSTERING_UNARY, CLUSTERING_WEIGHTS
 
 SEEDS = st.integers(0, 10_000)
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3], [0.2, -0.2, -1.0]], dtype=torch.float64)

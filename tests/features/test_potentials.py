@@ -12,8 +12,9 @@ from torch import Tensor
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features.potentials import PairView, find_candidates, shape_score
-from torchcrf_scan.features.scales import SHAPE_CHANNELS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.names import SHAPE_CHANNELS
 
 N, M, C = 14, 11, 3
 MOTIONS = torch.tensor([[0.1, 3.0, -1.0], [-0.2, -2.0, 4.0], [0.0, 50.0, 50.0]], dtype=torch.float64)[None]

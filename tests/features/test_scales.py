@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from torchcrf_scan.config import FeatureConfig
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS, live_weights
+from torchcrf_scan.features.scales import live_weights
 from torchcrf_scan.model import JointScanCRF, ModelConfig
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS
 
 EVERY = [*(f"association.{name}" for name in ASSOCIATION_WEIGHTS), *(f"clustering.{name}" for name in CLUSTERING_WEIGHTS)]
 

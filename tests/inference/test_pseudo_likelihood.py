@@ -17,7 +17,7 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.candidates import with_targets
 from torchcrf_scan.features.potentials import Boosters, PairView
-from torchcrf_scan.features.scales import CLUSTERING_UNARY, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.pseudo_likelihood import (
     Design,
@@ -31,6 +31,7 @@ from torchcrf_scan.inference.pseudo_likelihood import (
 )
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
+from torchcrf_scan.names import CLUSTERING_UNARY
 
 N, M, C = 6, 5, 3
 DENSE = InferenceConfig(candidates=0)

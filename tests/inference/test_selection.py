@@ -12,12 +12,13 @@ from support import assert_close, generator, make_points, normal
 from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.potentials import Boosters, PairView, clustering_unary
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_UNARY, CLUSTERING_WEIGHTS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.selection import ClusterPotential, discard_vacuous, evidence
+from torchcrf_scan.inference.selection import discard_vacuous, evidence
 from torchcrf_scan.inference.start import Start
-from torchcrf_scan.inference.state import Parameters
+from torchcrf_scan.inference.state import ClusterPotential, Parameters
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_UNARY, CLUSTERING_WEIGHTS
 
 CONFIG = InferenceConfig(clusters=4)
 MODEL = JointScanCRF().double()

@@ -5,16 +5,17 @@ import pytest
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.experiment.methods import Models, Study, fit_models
-from torchcrf_scan.experiment.settings import ExperimentConfig
-from torchcrf_scan.learning.settings import Config, LearningConfig
+from torchcrf_scan.experiment.models import Models, fit_models
+from torchcrf_scan.experiment.settings import ExperimentConfig, RunConfig
+from torchcrf_scan.experiment.study import Study
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.scan import ScanPair
 
 
 @pytest.fixture(scope="session")
-def small_config() -> Config:
+def small_config() -> RunConfig:
     """So little of everything that a fold takes a second."""
-    return Config(
+    return RunConfig(
         model=ModelConfig(features=FeatureConfig(stumps=4), inference=InferenceConfig(clusters=5, iterations=4)),
         learning=LearningConfig(folds=2, max_steps=8, booster_examples=500, batch_size=2),
         experiment=ExperimentConfig(jobs=1, resamples=50),
@@ -28,11 +29,11 @@ def small_pairs() -> list[ScanPair]:
 
 
 @pytest.fixture(scope="session")
-def study(small_pairs: list[ScanPair], small_config: Config) -> Study:
+def study(small_pairs: list[ScanPair], small_config: RunConfig) -> Study:
     return Study.of(small_pairs, small_config, jobs=1)
 
 
 @pytest.fixture(scope="session")
-def models(study: Study, small_config: Config) -> Models:
+def models(study: Study, small_config: RunConfig) -> Models:
     """Fitted on the first four pairs."""
     return fit_models(study, range(4), small_config, variants=True)

@@ -5,7 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchcrf_scan.experiment import cross_validation
-from torchcrf_scan.experiment.methods import JOINT, Answer, Models, Study
+from torchcrf_scan.experiment.methods import Answer
+from torchcrf_scan.experiment.models import JOINT, Models
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
 
 BEAMS = 12

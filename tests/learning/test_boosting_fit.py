@@ -15,10 +15,11 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.features.potentials import OUTLIER_INPUTS, Boosters, PairView
-from torchcrf_scan.features.scales import LOCAL_CHANNELS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.learning import boosting_fit
 from torchcrf_scan.learning.boosting_fit import data_examples, fit_boosters, fit_stumps, outlier_examples, sample_targets
+from torchcrf_scan.names import LOCAL_CHANNELS
 
 
 def toy(count: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,8 @@ from scipy.special import expit
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.evaluation.calibration import consistency, expected_calibration_error
 from torchcrf_scan.evaluation.metrics import score_pair
-from torchcrf_scan.experiment.methods import JOINT, Models, Study
+from torchcrf_scan.experiment.models import JOINT, Models
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.inference.uncertainty import Calibration
 from torchcrf_scan.learning import calibration_fit
 from torchcrf_scan.learning.calibration_fit import (

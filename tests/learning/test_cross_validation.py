@@ -12,8 +12,9 @@ from made_up import RIVAL, Recorder, guess, make_pairs, make_study
 
 from torchcrf_scan.experiment import cross_validation
 from torchcrf_scan.experiment.cross_validation import SECONDS, Fold, cores, file_name, make_folds, read_folds, run_folds, write_fold
-from torchcrf_scan.experiment.methods import JOINT, METHODS, Answer
-from torchcrf_scan.learning.settings import Config
+from torchcrf_scan.experiment.methods import METHODS, Answer
+from torchcrf_scan.experiment.models import JOINT
+from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.scan import ScanPair
 
 BY_PAIR, BY_SEQUENCE = "leave_one_pair_out", "leave_one_sequence_out"
@@ -90,7 +91,7 @@ def folds_of(pairs: list[ScanPair]) -> dict[str, list[Fold]]:
 def run(folder: Path, pairs: list[ScanPair], folds: dict[str, list[Fold]]) -> int:
     """Runs what is missing; returns how often the pairs were looked at."""
     looked = []
-    run_folds(lambda jobs: looked.append(jobs) or make_study(pairs), folds, Config(), folder, 1)  # type: ignore[func-returns-value]
+    run_folds(lambda jobs: looked.append(jobs) or make_study(pairs), folds, RunConfig(), folder, 1)  # type: ignore[func-returns-value]
     assert set(looked) <= {1}
     return len(looked)
 
@@ -185,13 +186,13 @@ SCRIPT = """
 import os, sys
 from pathlib import Path
 from made_up import Recorder, make_pairs, make_study
-from torchcrf_scan.config import Config
+from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.cross_validation import make_folds, run_folds
 rank, pairs, recorder = os.environ["RANK"], make_pairs(*"aabc"), Recorder()
 recorder.install()
 protocols = ("leave_one_pair_out", "leave_one_sequence_out")
 folds = {protocol: make_folds(protocol, pairs, 4) for protocol in protocols}
-run_folds(lambda jobs: make_study(pairs), folds, Config(), Path(sys.argv[1]) / rank, 1)
+run_folds(lambda jobs: make_study(pairs), folds, RunConfig(), Path(sys.argv[1]) / rank, 1)
 print(len(recorder.trained))
 """
 

@@ -26,9 +26,10 @@ from torchcrf_scan.experiment.experiment import (
     worst_pairs,
     write_tables,
 )
-from torchcrf_scan.experiment.methods import JOINT, Study
-from torchcrf_scan.experiment.settings import ExperimentConfig
-from torchcrf_scan.learning.settings import Config, LearningConfig
+from torchcrf_scan.experiment.models import JOINT
+from torchcrf_scan.experiment.settings import ExperimentConfig, RunConfig
+from torchcrf_scan.experiment.study import Study
+from torchcrf_scan.learning.settings import LearningConfig
 
 SMALL = ExperimentConfig(jobs=1, resamples=20)
 
@@ -36,7 +37,7 @@ SMALL = ExperimentConfig(jobs=1, resamples=20)
 
 
 def test_a_folder_belongs_to_one_experiment(tmp_path: Path) -> None:
-    pairs, config = make_pairs("a", "b"), Config(experiment=SMALL)
+    pairs, config = make_pairs("a", "b"), RunConfig(experiment=SMALL)
     claim(tmp_path / "new", config, pairs)
     settings = (tmp_path / "new" / "experiment.json").read_bytes()
     harmless = replace(
@@ -51,24 +52,24 @@ def test_a_folder_belongs_to_one_experiment(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "setting"),
     [
-        (Config(learning=LearningConfig(seed=1)), "learning.seed"),
-        (Config(model=ModelConfig(inference=InferenceConfig(clusters=4))), "model.inference.clusters"),
-        (Config(experiment=ExperimentConfig(test_every=2)), "experiment.test_every"),
-        (Config(experiment=ExperimentConfig(also_train=("indoor",))), "experiment.also_train"),
+        (RunConfig(learning=LearningConfig(seed=1)), "learning.seed"),
+        (RunConfig(model=ModelConfig(inference=InferenceConfig(clusters=4))), "model.inference.clusters"),
+        (RunConfig(experiment=ExperimentConfig(test_every=2)), "experiment.test_every"),
+        (RunConfig(experiment=ExperimentConfig(also_train=("indoor",))), "experiment.also_train"),
     ],
 )
-def test_another_experiment_is_refused_by_the_setting(tmp_path: Path, changed: Config, setting: str) -> None:
+def test_another_experiment_is_refused_by_the_setting(tmp_path: Path, changed: RunConfig, setting: str) -> None:
     pairs = make_pairs("a", "b")
-    claim(tmp_path, Config(), pairs)
+    claim(tmp_path, RunConfig(), pairs)
     with pytest.raises(ValueError, match=f"--output {tmp_path}: expected .* the same experiment, got one with another {setting}$"):
         claim(tmp_path, changed, pairs)
 
 
 def test_other_pairs_are_another_experiment(tmp_path: Path) -> None:
     pairs = make_pairs("a", "b", "c")
-    claim(tmp_path, Config(), pairs)
+    claim(tmp_path, RunConfig(), pairs)
     with pytest.raises(ValueError, match=r"got one with another tested$"):
-        claim(tmp_path, Config(), pairs[:2])
+        claim(tmp_path, RunConfig(), pairs[:2])
 
 
 def test_differing_settings_are_named_from_the_top() -> None:
@@ -94,9 +95,9 @@ def test_a_pair_that_is_not_there_cannot_be_drawn(name: str) -> None:
 
 
 def test_simulated_pairs_have_names_of_their_own() -> None:
-    few = replace(Config().data, pairs=2, sequences=2)
+    few = replace(RunConfig().data, pairs=2, sequences=2)
     experiment = ExperimentConfig(worlds=("street", "indoor"), also_train=("street",))
-    pairs, tested = load_pairs(Config(data=few, experiment=experiment))
+    pairs, tested = load_pairs(RunConfig(data=few, experiment=experiment))
     assert (len(pairs), tested) == (6, 4)
     assert len({pair.name for pair in pairs}) == len({pair.sequence for pair in pairs}) == 6
 
@@ -106,7 +107,7 @@ def test_pairs_without_annotation_are_refused(tmp_path: Path) -> None:
     write_pair(tmp_path / "bare.npz", replace(pair, annotation=None))
     for experiment, got in ((ExperimentConfig(pairs=str(tmp_path)), r"\['bare'\]"), (ExperimentConfig(worlds=()), "none")):
         with pytest.raises(ValueError, match=f"experiment.pairs: expected annotated pairs, got {got}"):
-            load_pairs(Config(experiment=experiment))
+            load_pairs(RunConfig(experiment=experiment))
 
 
 # --- results ------------------------------------------------------------------------------------------------------------------
@@ -131,7 +132,7 @@ def test_the_worst_pairs_are_those_that_lose_most_against_the_start() -> None:
 
 
 @pytest.fixture
-def pair_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Config]:
+def pair_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], RunConfig]:
     """The settings of an experiment on four pairs in files, with cheap models and blank figures."""
     (tmp_path / "pairs").mkdir()
     for pair in make_pairs(*"aabc"):
@@ -140,11 +141,11 @@ def pair_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], 
     for name in ("plot_associations", "plot_clusters"):
         monkeypatch.setattr(module, name, lambda pair, predictions: Figure((0.2, 0.2)))  # drawing takes time, and has its own tests
     experiment = replace(SMALL, pairs=str(tmp_path / "pairs"))
-    return lambda **changes: Config(output=str(tmp_path / "run"), experiment=replace(experiment, **changes))
+    return lambda **changes: RunConfig(output=str(tmp_path / "run"), experiment=replace(experiment, **changes))
 
 
 def test_a_run_leaves_tables_figures_and_events(
-    pair_files: Callable[..., Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pair_files: Callable[..., RunConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorder = Recorder()
     recorder.install(monkeypatch)
@@ -172,14 +173,14 @@ def test_a_run_leaves_tables_figures_and_events(
     assert (tmp_path / "run" / "figures" / "leave_one_sequence_out" / "clusters_pair_1.png").is_file()
 
 
-def test_a_run_that_cannot_be_leaves_nothing(pair_files: Callable[..., Config], tmp_path: Path) -> None:
+def test_a_run_that_cannot_be_leaves_nothing(pair_files: Callable[..., RunConfig], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"experiment.figures: expected SEQUENCE:NUMBER .* got z:0"):
         run_experiment(pair_files(figures=("z:0",)))
     assert not (tmp_path / "run").exists()
 
 
 def test_ablations_are_one_table_beside_the_model(
-    pair_files: Callable[..., Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pair_files: Callable[..., RunConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorder = Recorder()
     recorder.install(monkeypatch)
@@ -198,14 +199,16 @@ def test_ablations_are_one_table_beside_the_model(
     assert len(recorder.trained) == 8
 
 
-def test_a_variants_pairs_are_among_those_of_the_model(pair_files: Callable[..., Config], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_variants_pairs_are_among_those_of_the_model(
+    pair_files: Callable[..., RunConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
     Recorder().install(monkeypatch)
     base = pair_files(test_every=2)
     (table,) = run_ablations(base, {"thin": replace(base, experiment=replace(base.experiment, test_every=3))})
     assert [row[1] for row in table.rows] == [2.0, 1.0]  # every second pair, every sixth
 
 
-def test_a_rank_that_only_helps_has_no_tables(pair_files: Callable[..., Config], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rank_that_only_helps_has_no_tables(pair_files: Callable[..., RunConfig], monkeypatch: pytest.MonkeyPatch) -> None:
     helped = []
     monkeypatch.setattr(module, "run_folds", lambda *arguments: helped.append(arguments))
     monkeypatch.setattr(module, "rank_and_world", lambda: (1, 2))

@@ -10,12 +10,12 @@ from support import PAPER_ASSOCIATION, PAPER_CLUSTERING
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, FREE_SPACE_WEIGHTS, LOCAL_CHANNELS
 from torchcrf_scan.inference.pseudo_likelihood import pseudo_log_likelihood
 from torchcrf_scan.learning.fit import fit, fit_all_boosters, prepare, set_weights
 from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, FREE_SPACE_WEIGHTS, LOCAL_CHANNELS
 from torchcrf_scan.scan import ScanPair
 from torchcrf_scan.search.score import HypothesisScore
 

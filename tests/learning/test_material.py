@@ -10,7 +10,7 @@ from support import assert_close
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.experiment.methods import Study
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning import material as material_module
 from torchcrf_scan.learning.material import Collection, assign_folds, collect
 from torchcrf_scan.learning.settings import LearningConfig

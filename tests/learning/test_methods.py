@@ -4,31 +4,21 @@ import copy
 import itertools
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
+from torchcrf_scan.baselines.register import BASELINES, Baseline, installed
 from torchcrf_scan.config import EncoderConfig
-from torchcrf_scan.experiment.methods import (
-    ENCODED,
-    EXACT,
-    JOINT,
-    LATTICE,
-    LATTICE_EXACT,
-    METHODS,
-    Answer,
-    Models,
-    Study,
-    answer,
-    fit_models,
-    with_config,
-    with_motions_given,
-)
+from torchcrf_scan.experiment.methods import METHODS, Answer, answer, with_config, with_motions_given
+from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT, LATTICE, LATTICE_EXACT, Models, fit_models
+from torchcrf_scan.experiment.settings import RunConfig
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.learning.calibration_fit import calibrate
-from torchcrf_scan.learning.settings import Config, GradientConfig
+from torchcrf_scan.learning.settings import GradientConfig
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
@@ -44,17 +34,19 @@ def answers(models: Models, small_pairs: list[ScanPair]) -> dict[str, Answer]:
 
 def test_every_row_that_can_be_there_is_there(answers: dict[str, Answer]) -> None:
     assert len(set(METHODS)) == len(METHODS)
-    assert set(answers) == set(METHODS) - {ENCODED} - (set(LIBRARIES) - set(installed_libraries()))
+    assert set(answers) == set(METHODS) - {ENCODED} - (set(BASELINES) - set(installed()))
 
 
 def test_a_library_has_its_row_where_it_is_installed(
     answers: dict[str, Answer], models: Models, small_pairs: list[ScanPair], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     still = answers["all background"].prediction
-    monkeypatch.setattr("torchcrf_scan.experiment.methods.installed_libraries", lambda: dict.fromkeys(LIBRARIES, lambda _: still))
+    libraries = {row: Baseline(lambda case: still) for row, baseline in BASELINES.items() if baseline.requires}
+    monkeypatch.setattr("torchcrf_scan.experiment.methods.installed", lambda: {**BASELINES, **libraries})
     found = answer(models, small_pairs[5])
-    assert set(found) == set(METHODS) - {ENCODED}
-    assert all(found[name].prediction is still for name in LIBRARIES)
+    assert list(found) == [row for row in METHODS if row != ENCODED]
+    assert len(libraries) == 2
+    assert all(found[row].prediction is still for row in libraries)
 
 
 def test_answers_are_of_the_pair_and_took_time(answers: dict[str, Answer], small_pairs: list[ScanPair]) -> None:
@@ -106,7 +98,7 @@ def test_true_motions_and_true_associations_stay(answers: dict[str, Answer], sma
 
 
 def test_the_joint_model_alone_is_the_same_model(
-    study: Study, models: Models, small_pairs: list[ScanPair], small_config: Config
+    study: Study, models: Models, small_pairs: list[ScanPair], small_config: RunConfig
 ) -> None:
     config = replace(small_config, experiment=replace(small_config.experiment, joint_alone=True))
     alone = fit_models(study, range(4), config, variants=True)
@@ -129,7 +121,7 @@ def test_the_joint_models_share_their_features(models: Models) -> None:
 
 
 def test_a_model_with_an_encoder_goes_on_from_the_joint_model(
-    study: Study, models: Models, small_pairs: list[ScanPair], small_config: Config
+    study: Study, models: Models, small_pairs: list[ScanPair], small_config: RunConfig
 ) -> None:
     config = replace(
         small_config,
@@ -151,7 +143,7 @@ def test_a_model_with_an_encoder_goes_on_from_the_joint_model(
         fit_models(study, range(4), replace(config, gradient=GradientConfig()), variants=False)
 
 
-def test_every_joint_model_is_calibrated_on_what_it_was_fitted_on(study: Study, models: Models, small_config: Config) -> None:
+def test_every_joint_model_is_calibrated_on_what_it_was_fitted_on(study: Study, models: Models, small_config: RunConfig) -> None:
     """The fold's own pairs alone: a second calibration on them changes nothing."""
     for name, model in models.joint.items():
         again = copy.deepcopy(model)
@@ -170,7 +162,7 @@ def test_a_lattice_may_be_the_joint_model(models: Models, small_pairs: list[Scan
     assert joint_rows(answer(lattice, small_pairs[4])) == [JOINT, *ORACLES]
 
 
-def test_flooding_has_no_lattice_and_holds_true_motions_by_the_sweep(study: Study, small_config: Config) -> None:
+def test_flooding_has_no_lattice_and_holds_true_motions_by_the_sweep(study: Study, small_config: RunConfig) -> None:
     inference = replace(small_config.model.inference, schedule="flooding", iterations=1)  # no answer counts here
     config = replace(small_config, model=replace(small_config.model, inference=inference))
     flooding = fit_models(study, range(4), config, variants=True)
@@ -188,3 +180,17 @@ def test_another_config_shares_the_weights(models: Models) -> None:
         assert mine is theirs, name
     assert other.scales is model.scales
     assert other.boosters is model.boosters
+
+
+def test_variants_that_share_their_features_fit_them_once(
+    study: Study, models: Models, small_config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = replace(study, kept=tmp_path)
+    config = replace(small_config, experiment=replace(small_config.experiment, joint_alone=True))
+    first = fit_models(kept, range(4), config, variants=False).joint[JOINT]
+    assert len(list(tmp_path.iterdir())) == 1
+    monkeypatch.setattr("torchcrf_scan.learning.fit.fit_all_boosters", lambda *_: pytest.fail("fitted again"))
+    faster = replace(config, model=replace(config.model, inference=replace(config.model.inference, iterations=1)))
+    again = fit_models(kept, range(4), faster, variants=False).joint[JOINT]
+    assert torch.equal(again.boosters.data.table, first.boosters.data.table)
+    assert torch.equal(first.boosters.data.table, models.joint[JOINT].boosters.data.table)

@@ -10,13 +10,14 @@ from support import assert_close
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import ModelConfig
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, live_weights
+from torchcrf_scan.features.scales import live_weights
 from torchcrf_scan.inference.pseudo_likelihood import association_chain, clustering_chain, true_plugins
 from torchcrf_scan.learning.objectives import known_nodes, likelihood
 from torchcrf_scan.learning.portions import Portion
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.learning.weights_fit import stack
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 
 NAMES = ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 

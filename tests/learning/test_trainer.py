@@ -9,10 +9,10 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.learning.settings import DataConfig
 from torchcrf_scan.learning.trainer import load_data, pairs_to_draw, refuse_leaks, versions
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.scan import Scan, ScanPair
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -3,59 +3,63 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 
 import numpy as np
 
-from torchcrf_scan.baselines.labels import all_outliers
+from torchcrf_scan.baselines.labels import IDENTITY, all_outliers
 from torchcrf_scan.baselines.trimmed_icp import match_under
 from torchcrf_scan.scan import Floats, PairPrediction, Scan, ScanPair
 
 REACH = 1.0  # metres between corresponding points, small_gicp's default; Open3D has none
 FEWEST_POINTS = 3
+ITERATIONS = 50
 
 
-def match_small_gicp(pair: ScanPair) -> PairPrediction:
-    """Background everywhere under small_gicp's ICP from the identity (its GICP needs normals, and a plane's are all vertical)."""
-    if min(len(pair.source), len(pair.target)) < FEWEST_POINTS:
-        return _unregistered(pair)
+def register_small_gicp(pair: ScanPair, guess: Floats = IDENTITY) -> Floats:
+    """(3,) motion of small_gicp's ICP by one thread, clouds and tree made anew; its GICP needs normals, which no plane has."""
     import small_gicp
 
     target, source = (small_gicp.PointCloud(_flat_cloud(scan)) for scan in (pair.target, pair.source))
-    found = small_gicp.align(target, source, registration_type="ICP", max_correspondence_distance=REACH, max_iterations=50)
-    return match_under(pair, planar_motion(found.T_target_source))
+    options = {"registration_type": "ICP", "max_correspondence_distance": REACH, "max_iterations": ITERATIONS, "num_threads": 1}
+    return planar_motion(small_gicp.align(target, source, init_T_target_source=spatial_motion(guess), **options).T_target_source)
 
 
-def match_open3d(pair: ScanPair) -> PairPrediction:
-    """Background everywhere under Open3D's point-to-point ICP from the identity."""
-    if min(len(pair.source), len(pair.target)) < FEWEST_POINTS:
-        return _unregistered(pair)
+def register_open3d(pair: ScanPair, guess: Floats = IDENTITY) -> Floats:
+    """(3,) motion of Open3D's point-to-point ICP; it chooses its threads itself."""
     import open3d
 
     source, target = (
         open3d.geometry.PointCloud(open3d.utility.Vector3dVector(_flat_cloud(scan))) for scan in (pair.source, pair.target)
     )
-    found = open3d.pipelines.registration.registration_icp(source, target, REACH)
-    return match_under(pair, planar_motion(found.transformation))
+    found = open3d.pipelines.registration.registration_icp(source, target, REACH, spatial_motion(guess))
+    return planar_motion(found.transformation)
 
 
-LIBRARIES: dict[str, tuple[str, Callable[[ScanPair], PairPrediction]]] = {
-    "small_gicp (ICP)": ("small_gicp", match_small_gicp),
-    "Open3D (ICP)": ("open3d", match_open3d),
-}
+def match_small_gicp(pair: ScanPair) -> PairPrediction:
+    """Background everywhere under `register_small_gicp` from the identity."""
+    return _match(pair, register_small_gicp)
 
 
-def installed_libraries() -> dict[str, Callable[[ScanPair], PairPrediction]]:
-    """Row name -> method, of the libraries that can be imported here; one that is installed may still lack what it needs."""
-    return {row: match for row, (module, match) in LIBRARIES.items() if _can_import(module)}
+def match_open3d(pair: ScanPair) -> PairPrediction:
+    """Background everywhere under `register_open3d` from the identity."""
+    return _match(pair, register_open3d)
 
 
-def _can_import(module: str) -> bool:
-    try:
-        import_module(module)
-    except ImportError:
-        return False
-    return True
+def _match(pair: ScanPair, register: Callable[[ScanPair], Floats]) -> PairPrediction:
+    """Too few points to register stay where they are."""
+    if not len(pair.source) or not len(pair.target):
+        return all_outliers(pair)
+    is_enough = min(len(pair.source), len(pair.target)) >= FEWEST_POINTS
+    return match_under(pair, register(pair) if is_enough else IDENTITY)
+
+
+def spatial_motion(motion: Floats) -> Floats:
+    """(4, 4) rigid transform about the vertical of a motion (3,) in the plane."""
+    theta, x, y = motion
+    transform = np.eye(4)
+    transform[:2, :2] = [[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]]
+    transform[:2, 3] = x, y
+    return transform
 
 
 def planar_motion(transform: Floats) -> Floats:
@@ -66,9 +70,3 @@ def planar_motion(transform: Floats) -> Floats:
 def _flat_cloud(scan: Scan) -> Floats:
     """(N, 3) points at height 0."""
     return np.column_stack([scan.points, np.zeros(len(scan))])
-
-
-def _unregistered(pair: ScanPair) -> PairPrediction:
-    """What the libraries are not asked: too few points to register stay where they are."""
-    is_empty = not len(pair.source) or not len(pair.target)
-    return all_outliers(pair) if is_empty else match_under(pair, np.zeros(3))

@@ -1,5 +1,5 @@
-"""What the model costs: time by stage, size, batch and threads, memory, rivals in the same run, and how far from the limit it is.
+"""What the model costs: whole pairs by size, batch and threads, learning, memory, rivals in the same run, and the limit.
 
-`torchcrf-scan bench` puts the parts together (`study.py`). Everything is timed in turns (`timing.py`), so that what else the
-machine does falls on all alike.
+`torchcrf-scan bench` puts the parts together (`study.py`). Everything is timed in turns (`timing.py`), so that other load on the
+machine falls on all alike.
 """

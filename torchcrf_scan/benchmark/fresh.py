@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from torchcrf_scan.benchmark.backends import with_backend
+from torchcrf_scan.benchmark.plan import with_backend
 from torchcrf_scan.benchmark.scenes import in_mode
 from torchcrf_scan.data.pair_file import read_pair, write_pair
 from torchcrf_scan.model import JointScanCRF

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
-from torchcrf_scan.benchmark.backends import with_backend
 from torchcrf_scan.benchmark.scenes import MODES, in_mode, street_pairs
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
@@ -15,6 +15,8 @@ from torchcrf_scan.scan import ScanPair
 CENTRE = 361  # beams at which all else is compared
 GROWTH = 1.5  # a guess of how time grows with the number of beams, to foresee a call
 SIMULATED, RECORDED = "simulated", "recorded"
+WHOLE = "whole"  # stage of the rows of whole pairs
+BACKENDS = ("compiled", "eager")
 
 Row = dict[str, Any]
 Setting = tuple[int, int, int]  # batch, beams, threads
@@ -84,3 +86,18 @@ class Material:
 def place_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
     """Backend, mode, batch, beams and threads, None for what the row does not have."""
     return tuple(row.get(key) for key in ("backend", "mode", "batch", "beams", "threads"))
+
+
+def choose_backends(wanted: Sequence[str]) -> tuple[str, ...]:
+    """Those that are wanted, or all where none is named. Raises ValueError for an unknown one."""
+    for name in wanted:
+        if name not in BACKENDS:
+            raise ValueError(f"--backends: expected some of {', '.join(BACKENDS)}, got {name}")
+    return tuple(wanted) or BACKENDS
+
+
+def with_backend(model: JointScanCRF, backend: str) -> JointScanCRF:
+    """The same model, its rounds run by one of `BACKENDS`."""
+    other = copy.copy(model)
+    other.config = replace(model.config, inference=replace(model.config.inference, backend=backend))
+    return other

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import math
 import os
+import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from torchcrf_scan.benchmark.machine import Rates, describe_machine
-from torchcrf_scan.benchmark.stages import STAGES, WHOLE
+from torchcrf_scan.benchmark.limits import Rates
+from torchcrf_scan.benchmark.plan import WHOLE
 from torchcrf_scan.evaluation.report import Table
 
 Row = Mapping[str, Any]
@@ -28,6 +30,32 @@ def write_report(path: Path, rows: Sequence[Row], rates: Rates) -> None:
     os.replace(temporary, path)
 
 
+def describe_machine() -> dict[str, Any]:
+    """Processor, cores and versions."""
+    return {
+        "processor": _processor(),
+        "cpu_count": os.cpu_count(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        **{name: _version(name) for name in ("torch", "numpy", "numba")},
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.processor())
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
 def _finite(row: Row) -> dict[str, Any]:
     values = {**dict.fromkeys(EVERYWHERE), **row}
     return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in values.items()}
@@ -38,17 +66,16 @@ def report_tables(rows: Sequence[Row], rates: Rates) -> list[Table]:
     of_stage: dict[str, list[Row]] = {}
     for row in rows:
         of_stage.setdefault(row["stage"], []).append(row)
-    calls = [row for row in rows if row["stage"] in STAGES]
     tables = [
         whole_table(of_stage.get(WHOLE, [])),
         recorded_table(of_stage.get(WHOLE, [])),
-        stages_table(calls),
         registration_table(of_stage.get("registration", [])),
         chain_table(of_stage.get("chain", [])),
         growth_table(of_stage.get("growth", [])),
         fresh_table([*of_stage.get("first_call", []), *of_stage.get("peak_memory", [])]),
         training_table([row for row in rows if "seconds" in row]),
         limit_table(of_stage.get("limit", []), rates),
+        beside_table(of_stage.get("beside", [])),
     ]
     return [table for table in tables if table.rows]
 
@@ -84,7 +111,10 @@ def whole_table(rows: Sequence[Row]) -> Table:
     order = {tuple(str(row[key]) for key in keys): k for k, row in reversed(list(enumerate(mine)))}
     cells.sort(key=lambda of: order[of[: len(keys)]])
     headings = (*keys, *(f"{beams} beams" for beams in columns))
-    note = "cold: no prior motion; warm: one as odometry gives it; -: not timed, too slow (see --full, --patience)."
+    note = (
+        "Processor time of one thread, wall time of several. cold: no prior motion; warm: one as odometry gives it; -: not timed, "
+        "too slow (see --full, --patience)."
+    )
     return Table("Whole pair, ms per pair", headings, tuple(cells), (*[0] * len(keys), *[2] * len(columns)), note)
 
 
@@ -93,23 +123,6 @@ def recorded_table(rows: Sequence[Row]) -> Table:
     mine = [row for row in rows if row["data"] == "recorded"]
     cells = tuple((row["backend"], row["mode"], _number(row, "beams"), _number(row, "median_ms_per_pair")) for row in mine)
     return Table("Recorded pairs, one at a time", ("backend", "mode", "beams", "ms per pair"), cells, (0, 0, 0, 2))
-
-
-def stages_table(rows: Sequence[Row]) -> Table:
-    """One call of every stage of a single pair: a column a number of beams, the smallest batch and number of threads."""
-    least = {key: min((row[key] for row in rows), default=0) for key in ("batch", "threads")}
-    mine = [row for row in rows if all(row[key] == value for key, value in least.items())]
-    keys = ("stage", "backend", "mode")
-    columns, cells = _pivot(_sorted(mine, ("beams",)), keys, "beams", "median_ms_per_pair")
-    calls = {tuple(str(row[key]) for key in keys): _number(row, "calls_per_pair") for row in mine}
-    order = {stage: k for k, stage in enumerate(STAGES)}
-    cells = sorted(((*of[:3], calls[of[:3]], *of[3:]) for of in cells), key=lambda of: (*of[1:3], order[of[0]]))
-    headings = (*keys, "calls per pair", *(f"{beams} beams" for beams in columns))
-    note = (
-        f"A call each, batch {least['batch']}, {least['threads']} thread(s); a pair needs as many as the fourth column says. "
-        "Compiled candidates and boosted scores as in a first round; later rounds look at what has changed alone."
-    )
-    return Table("Stages, ms per call and pair", headings, tuple(cells), (0, 0, 0, 1, *[3] * len(columns)), note)
 
 
 def _ratios(rows: Sequence[Row], suffix: str) -> list[str]:
@@ -178,7 +191,7 @@ def fresh_table(rows: Sequence[Row]) -> Table:
 
 
 def training_table(rows: Sequence[Row]) -> Table:
-    """Seconds of learning."""
+    """Learning, in seconds of processor time."""
     cells = ((row["stage"], _number(row, "seconds"), str(row["pairs"]), _note(row)) for row in rows)
     return Table("Training", ("what", "s", "pairs", "note"), tuple(cells), (0, 1, 0, 0))
 
@@ -187,17 +200,24 @@ def limit_table(rows: Sequence[Row], rates: Rates) -> Table:
     """How far from what the machine could do."""
     backends = [key.removesuffix("_to_limit") for key in _ratios(rows, "_to_limit")]
     columns = (f"{name}{end}" for name in backends for end in (", ms", " / limit"))
-    headings = ("stage", "mode", "operations (M)", "bytes (MB)", "limit, ms", *columns)
+    headings = ("mode", "operations (M)", "bytes (MB)", "limit, ms", *columns)
     cells = (
         (
-            *(row["of"], row["mode"], row["operations"] / 1e6, row["bytes"] / 1e6, row["limit_ms_per_pair"]),
+            *(row["mode"], row["operations"] / 1e6, row["bytes"] / 1e6, row["limit_ms_per_pair"]),
             *(_number(row, f"{name}{end}") for name in backends for end in ("_ms_per_pair", "_to_limit")),
         )
         for row in rows
     )
     note = (
-        f"All calls of a pair. One thread: {rates.bandwidth / 1e9:.1f} GB/s, {rates.matrix / 1e9:.1f} G operations/s in a matrix "
+        f"A whole pair. One thread: {rates.bandwidth / 1e9:.1f} GB/s, {rates.matrix / 1e9:.1f} G operations/s in a matrix "
         f"product (the limit), {rates.vector / 1e9:.1f} G/s in short vectors. Counted in benchmark/limits.py."
     )
-    digits = (0, 0, 2, 2, 4, *[2, 0] * len(backends))
+    digits = (0, 2, 2, 4, *[2, 0] * len(backends))
     return Table("How far from the limit", headings, tuple(cells), digits, note)
+
+
+def beside_table(rows: Sequence[Row]) -> Table:
+    """This package and another checkout of it, in turns."""
+    cells = tuple((row["task"], row["ms_per_pair"], row["other_ms_per_pair"], row["ratio"]) for row in rows)
+    note = "Processor time of one thread, medians."
+    return Table("Beside another checkout", ("call", "ms per pair", "other, ms per pair", "ratio"), cells, (0, 2, 2, 3), note)

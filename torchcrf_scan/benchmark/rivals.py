@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcrf_scan.baselines.libraries import REACH, planar_motion
+from torchcrf_scan.baselines.libraries import register_open3d, register_small_gicp
+from torchcrf_scan.batch import initial_motion_of
 from torchcrf_scan.inference.messages import chain_beliefs
-from torchcrf_scan.scan import Floats, Ints, Scan, ScanPair
+from torchcrf_scan.scan import Floats, Ints, ScanPair
 
-ITERATIONS = 50
 NODES, STATES = 361, (16, 17)
 SEED = 1
 Register = Callable[[ScanPair], Floats]
@@ -25,44 +25,16 @@ Decode = Callable[[], object]
 # --- registration -------------------------------------------------------------------------------------------------------------
 
 
-def _flat_cloud(scan: Scan) -> Floats:
-    """(N, 3) points at height 0."""
-    return np.column_stack([scan.points, np.zeros(len(scan))])
-
-
-def _spatial(pair: ScanPair) -> Floats:
-    """(4, 4) rigid transform of the prior motion, the identity without one."""
-    theta, x, y = (0.0, 0.0, 0.0) if pair.initial_motion is None else pair.initial_motion
-    transform = np.eye(4)
-    transform[:2, :2] = [[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]]
-    transform[:2, 3] = x, y
-    return transform
-
-
 def load_small_gicp() -> Register:
-    """small_gicp's ICP with one thread, its clouds and its tree made anew."""
-    small_gicp: Any = import_module("small_gicp")
-
-    def register(pair: ScanPair) -> Floats:
-        target, source = (small_gicp.PointCloud(_flat_cloud(scan)) for scan in (pair.target, pair.source))
-        options = {"registration_type": "ICP", "max_correspondence_distance": REACH, "max_iterations": ITERATIONS}
-        found = small_gicp.align(target, source, init_T_target_source=_spatial(pair), num_threads=1, **options)
-        return planar_motion(found.T_target_source)
-
-    return register
+    """small_gicp's ICP from the pair's initial motion."""
+    import_module("small_gicp")
+    return lambda pair: register_small_gicp(pair, initial_motion_of(pair))
 
 
 def load_open3d() -> Register:
-    """Open3D's point-to-point ICP; it chooses its threads itself."""
-    open3d: Any = import_module("open3d")
-
-    def register(pair: ScanPair) -> Floats:
-        clouds = [open3d.utility.Vector3dVector(_flat_cloud(scan)) for scan in (pair.source, pair.target)]
-        source, target = (open3d.geometry.PointCloud(points) for points in clouds)
-        found = open3d.pipelines.registration.registration_icp(source, target, REACH, _spatial(pair))
-        return planar_motion(found.transformation)
-
-    return register
+    """Open3D's ICP from the pair's initial motion."""
+    import_module("open3d")
+    return lambda pair: register_open3d(pair, initial_motion_of(pair))
 
 
 REGISTRATIONS: Mapping[str, Callable[[], Register]] = {"small_gicp ICP": load_small_gicp, "Open3D ICP": load_open3d}

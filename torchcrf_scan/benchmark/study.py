@@ -9,13 +9,12 @@ from itertools import product
 import numpy as np
 import torch
 
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.benchmark import limits, rivals
 from torchcrf_scan.benchmark.fresh import ask_fresh_process
-from torchcrf_scan.benchmark.machine import Rates
-from torchcrf_scan.benchmark.plan import SIMULATED, Material, Plan, Row, place_of
+from torchcrf_scan.benchmark.limits import Rates
+from torchcrf_scan.benchmark.plan import SIMULATED, WHOLE, Material, Plan, Row, place_of
 from torchcrf_scan.benchmark.scenes import MODES, cycle
-from torchcrf_scan.benchmark.stage_times import Course, follow, stage_rows, time_stages
-from torchcrf_scan.benchmark.stages import WHOLE
 from torchcrf_scan.benchmark.timing import Task, Timed, time_in_turns
 from torchcrf_scan.benchmark.whole import registration_rows, time_whole
 
@@ -93,48 +92,53 @@ def fresh_rows(plan: Plan, material: Material) -> list[Row]:
     return rows
 
 
-def limit_rows(plan: Plan, material: Material, timed: Sequence[Row], courses: dict[str, Course], rates: Rates) -> list[Row]:
-    """Work of every stage at the centre, the time at the machine's limit, and measured times over it."""
+def limit_rows(plan: Plan, material: Material, timed: Sequence[Row], rates: Rates) -> list[Row]:
+    """Work of a whole pair at the centre, the time at the machine's limit, and measured times over it."""
     batch, beams, threads = plan.centre
-    config = material.model("eager").config
     rows = []
     for mode in MODES:
-        points = round(float(np.mean([len(pair.source) for pair in material.pairs(beams, mode)])))
-        size = limits.Size(
-            points=points,
-            candidates=config.inference.candidates or points,
-            clusters=config.inference.clusters,
-            motions=courses[mode].motions,
-            rounds=courses[mode].rounds,
-            stumps=config.features.stumps,
-            is_warm=mode == "warm",
-        )
-        for stage, work in limits.count_work(size).items():
-            at_limit = work.milliseconds(rates)
-            row: Row = {"stage": "limit", "of": stage, "mode": mode, "batch": 1, "beams": beams, "threads": 1, "points": points}
-            row |= {"operations": work.operations, "bytes": work.bytes, "limit_ms_per_pair": at_limit}
-            for one in timed:
-                is_there = one["stage"] == stage and one.get("data") == SIMULATED and one["median_ms_per_pair"] is not None
-                if is_there and place_of(one)[1:] == (mode, batch, beams, threads):
-                    measured = one["median_ms_per_pair"] * one.get("calls_per_pair", 1.0)
-                    row[f"{one['backend']}_ms_per_pair"] = measured
-                    row[f"{one['backend']}_to_limit"] = measured / at_limit
-            rows.append(row)
+        size = size_of(material, beams, mode)
+        work = limits.count_work(size)
+        at_limit = work.milliseconds(rates)
+        row: Row = {"stage": "limit", "mode": mode, "batch": 1, "beams": beams, "threads": 1, "points": size.points}
+        row |= {"operations": work.operations, "bytes": work.bytes, "limit_ms_per_pair": at_limit}
+        for one in timed:
+            is_there = one.get("data") == SIMULATED and one["median_ms_per_pair"] is not None
+            if is_there and place_of(one)[1:] == (mode, batch, beams, threads):
+                row[f"{one['backend']}_ms_per_pair"] = one["median_ms_per_pair"]
+                row[f"{one['backend']}_to_limit"] = one["median_ms_per_pair"] / at_limit
+        rows.append(row)
     return rows
+
+
+@torch.no_grad()
+def size_of(material: Material, beams: int, mode: str) -> limits.Size:
+    """The usual numbers of points, rounds and motions of the pairs of one size."""
+    pairs, model = material.pairs(beams, mode), material.model("compiled")
+    answers = model(ScanPairBatch.collate(pairs).without_truth())
+    points = round(float(np.mean([len(pair.source) for pair in pairs])))
+    inference = model.config.inference
+    return limits.Size(
+        points=points,
+        candidates=inference.candidates or points,
+        clusters=inference.clusters,
+        motions=float(answers.active.sum(-1).float().mean()),
+        rounds=float(answers.iterations.float().mean()),
+        stumps=model.config.features.stumps,
+        is_warm=mode == "warm",
+    )
 
 
 def run_study(plan: Plan, rates: Rates) -> list[Row]:
     """All rows but those of learning."""
     material = Material(plan)
-    whole = time_whole(plan, material)
-    courses = {mode: follow(material, mode, plan.centre[1]) for mode in MODES}
-    stages = time_stages(plan, material, whole)
-    times = [one.as_row() for one in whole if one.task.row["stage"] == WHOLE] + stage_rows(stages, courses)
+    timed = time_whole(plan, material)
+    times = [one.as_row() for one in timed if one.task.row["stage"] == WHOLE]
     return [
         *times,
-        *registration_rows(whole, plan.centre),
+        *registration_rows(timed, plan.centre),
         *time_chains(plan),
-        *growth_rows(whole, plan),
+        *growth_rows(timed, plan),
         *fresh_rows(plan, material),
-        *limit_rows(plan, material, times, courses, rates),
+        *limit_rows(plan, material, times, rates),
     ]

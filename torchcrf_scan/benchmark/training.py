@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.benchmark.timing import threads_kept
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.experiment.cross_validation import cores
@@ -22,6 +23,7 @@ from torchcrf_scan.scan import ScanPair
 T = TypeVar("T")
 FOLDS = 31
 PASS = 1000
+ROUNDS, BATCHES = 3, (1, 32)  # of the unrolled layer, motions soft
 
 
 def time_training(pairs: Sequence[ScanPair], config: ModelConfig, learning: LearningConfig) -> list[dict[str, Any]]:
@@ -64,11 +66,29 @@ def _rows(pairs: Sequence[ScanPair], config: ModelConfig, learning: LearningConf
         ("fit_fold", fold, count, "without looking at the pairs, which all folds share"),
         (f"leave_one_out_{FOLDS}", everywhere, FOLDS, projected),
         (f"training_pass_{PASS}", once * PASS / count, PASS, f"pseudo-likelihood and its gradient, scaled from {count} pairs"),
+        *(
+            (f"rounds_{size}", _rounds(pairs, size), size, f"{ROUNDS} rounds forward and backward, from a given start")
+            for size in BATCHES
+        ),
     ]
     return [dict(zip(("stage", "seconds", "pairs", "note"), row, strict=True), threads=1) for row in rows]
 
 
+def _rounds(pairs: Sequence[ScanPair], size: int) -> float:
+    """Seconds of the unrolled layer and its gradient for a batch of some size; the second of two calls."""
+    model = JointScanCRF.from_pretrained(motion_weights="soft", stop_early=False, iterations=ROUNDS)
+    batch = ScanPairBatch.collate([pairs[k % len(pairs)] for k in range(size)]).without_truth()
+    start = model.initialise(batch)
+
+    def once() -> None:
+        answer = model(batch, start)
+        (answer.log_cluster[batch.source_mask].exp().sum() + answer.motions.square().sum()).backward()
+
+    once()
+    return _timed(once)[1]
+
+
 def _timed(run: Callable[[], T]) -> tuple[T, float]:
-    began = time.perf_counter()
+    began = time.process_time()
     made = run()
-    return made, time.perf_counter() - began
+    return made, time.process_time() - began

@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 
 from torchcrf_scan.benchmark import rivals
-from torchcrf_scan.benchmark.plan import GROWTH, RECORDED, SIMULATED, Material, Plan, Row, Setting, settings_of
+from torchcrf_scan.benchmark.plan import GROWTH, RECORDED, SIMULATED, WHOLE, Material, Plan, Row, Setting, settings_of
 from torchcrf_scan.benchmark.scenes import MODES, cycle, in_mode
-from torchcrf_scan.benchmark.stages import WHOLE
 from torchcrf_scan.benchmark.timing import Task, Timed, time_in_turns
 from torchcrf_scan.scan import ScanPair
 

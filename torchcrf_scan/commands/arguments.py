@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from safetensors import SafetensorError
 
 from torchcrf_scan.commands.failures import attempt
-from torchcrf_scan.data.carmen import CarmenLog, is_log
 from torchcrf_scan.data.dataset import PairFiles
+from torchcrf_scan.data.formats import ENDINGS, Recording, read_recording, reader_of
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
@@ -31,7 +30,7 @@ def load_model(name: str, candidates: int | None = None, device: str = "cpu", th
     changes: dict[str, Any] = {} if candidates is None else {"candidates": candidates}
     try:
         model = JointScanCRF.from_pretrained(name, **changes)
-    except (ValueError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
+    except ValueError as error:
         raise ValueError(f"--model {name}: {error}") from error
     try:
         return model.to(device)
@@ -44,7 +43,7 @@ class PairPlace:
     """Where a pair is found: in a file of its own, or at a number of a log."""
 
     path: Path
-    log: CarmenLog | None = None
+    log: Recording | None = None
     number: int = 0
 
     @property
@@ -73,32 +72,24 @@ def find_pairs(patterns: Sequence[str], every: int, failures: list[str]) -> list
     paths = PairFiles(*patterns).paths
     if every < 1:
         raise ValueError(f"--every: expected at least 1, got {every}")
-    if every > 1 and not any(is_log(path) for path in paths):
-        raise ValueError(f"--every: expected a log (.log, .log.gz) to take every {every}-th pair of, got pair files alone")
+    if every > 1 and not any(reader_of(path) for path in paths):
+        raise ValueError(f"--every: expected a log ({ENDINGS}) to take every {every}-th pair of, got pair files alone")
     found = []
     for path in paths:
-        if not is_log(path):
+        if reader_of(path) is None:
             found.append(PairPlace(path))
-        elif (log := attempt(failures, read_log, path)) is not None:
+        elif (log := attempt(failures, read_recording, path)) is not None:
             found += [PairPlace(path, log, number) for number in range(0, len(log), every)]
     return _each_once(found)
 
 
-def read_log(path: str | Path) -> CarmenLog:
-    """A log with at least one pair."""
-    log = CarmenLog(path)
-    if not len(log):
-        raise ValueError(f"{path}: expected at least two lines that start with FLASER, got one")
-    return log
-
-
 def read_one(file: str, number: int | None) -> ScanPair:
     """The pair of a pair file, which has no number, or one of the pairs of a log."""
-    if not is_log(file):
+    if reader_of(file) is None:
         if number is not None:
-            raise ValueError(f"--number: expected none but with a log (.log, .log.gz), got {number} with {file}")
+            raise ValueError(f"--number: expected none but with a log ({ENDINGS}), got {number} with {file}")
         return read_pair(file)
-    log = read_log(file)
+    log = read_recording(file)
     if number is None or not 0 <= number < len(log):
         raise ValueError(f"--number: expected which pair of {file}, 0 to {len(log) - 1}, got {number}")
     return log[number]

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from torchcrf_scan.commands.arguments import make_folder
 from torchcrf_scan.pretrained import PRETRAINED
+
+if TYPE_CHECKING:
+    from torchcrf_scan.benchmark.limits import Rates
+    from torchcrf_scan.benchmark.plan import Plan, Row
 
 
 def bench(
@@ -22,8 +27,9 @@ def bench(
     training_pairs: int = 30,
     patience: float = 15.0,
     full: bool = False,
+    beside: str = "",
 ) -> int:
-    """Times the whole pair and its stages, learning and rivals, measures memory, and says how far from the limit all this is.
+    """Times whole pairs, learning and rivals, measures memory, and gives the distance from the limit of this machine.
 
     Everything is timed in turns and given as medians, on simulated streets, cold (no prior motion) and warm (the true one, as
     wrong as odometry). Rivals that are installed run in the same turns (`pip install torchcrf-scan[bench]`). Tables are
@@ -42,16 +48,12 @@ def bench(
         training_pairs: pairs that one fold is fitted on, 0: no learning
         patience: seconds of a call from which on it is left out
         full: the reference (eager) in all sizes too, else in those that differ in one thing alone
+        beside: folder of another checkout of the package; then only the calls that both have are timed, in turns
     """
-    from torchcrf_scan.benchmark.backends import choose_backends
-    from torchcrf_scan.benchmark.machine import measure_rates
-    from torchcrf_scan.benchmark.plan import Plan
+    from torchcrf_scan.benchmark.limits import measure_rates
+    from torchcrf_scan.benchmark.plan import Plan, choose_backends
     from torchcrf_scan.benchmark.report import report_tables, write_report
-    from torchcrf_scan.benchmark.scenes import street_pairs
-    from torchcrf_scan.benchmark.study import run_study
-    from torchcrf_scan.config import ModelConfig
     from torchcrf_scan.data.dataset import PairFiles
-    from torchcrf_scan.learning.settings import LearningConfig
 
     for name, values in {"beams": beams, "batches": batches, "threads": threads}.items():
         if not values or min(values) < 1:
@@ -65,12 +67,30 @@ def bench(
     recorded = tuple(PairFiles(*patterns)) if patterns else ()
     plan = Plan(model, choose_backends(backends), beams, batches, threads, repeats, simulated, patience, recorded, full)
     rates = measure_rates()
-    rows = run_study(plan, rates)
-    if training_pairs:
-        from torchcrf_scan.benchmark.training import time_training
-
-        rows += time_training(street_pairs(plan.centre[1], training_pairs), ModelConfig(), LearningConfig())
+    rows = _compare(plan, Path(beside)) if beside else _measure(plan, rates, training_pairs)
     write_report(path, rows, rates)
     print("\n".join(table.to_markdown() for table in report_tables(rows, rates)), end="")
     print(f"\nall rows: {output}")
     return 0
+
+
+def _compare(plan: Plan, other: Path) -> list[Row]:
+    """The rows of this package beside another checkout."""
+    from torchcrf_scan.benchmark.beside import compare
+    from torchcrf_scan.benchmark.scenes import street_pairs
+
+    return compare(street_pairs(plan.centre[1], plan.pairs), plan.model, other, plan.repeats)
+
+
+def _measure(plan: Plan, rates: Rates, training_pairs: int) -> list[Row]:
+    """All rows of this package alone."""
+    from torchcrf_scan.benchmark.scenes import street_pairs
+    from torchcrf_scan.benchmark.study import run_study
+    from torchcrf_scan.benchmark.training import time_training
+    from torchcrf_scan.config import ModelConfig
+    from torchcrf_scan.learning.settings import LearningConfig
+
+    rows = run_study(plan, rates)
+    if training_pairs:
+        rows += time_training(street_pairs(plan.centre[1], training_pairs), ModelConfig(), LearningConfig())
+    return rows

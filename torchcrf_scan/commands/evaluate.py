@@ -6,13 +6,13 @@ import json as json_format
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from tqdm import tqdm
 
+from torchcrf_scan.baselines.register import by_command
 from torchcrf_scan.baselines.start import match_start, match_static
 from torchcrf_scan.commands import frames
 from torchcrf_scan.commands.arguments import batches, find_files, load_model, make_folder
@@ -21,6 +21,7 @@ from torchcrf_scan.data.pair_file import read_pair, read_prediction
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.whole_file import write_whole
 
 if TYPE_CHECKING:
     from torchcrf_scan.evaluation.metrics import PairScore
@@ -33,19 +34,16 @@ Loader = Callable[[], JointScanCRF]
 FAR_TRANSLATION, FAR_ROTATION = 0.2, 0.02  # metres, radians: an ego motion found although the frames are displaced
 
 
-def one_by_one(module: str, name: str) -> Method:
-    """A baseline that takes one pair, imported when it is asked for: it needs scipy."""
-    match = getattr(import_module(f"torchcrf_scan.baselines.{module}"), name)
-    return lambda pairs: [match(pair) for pair in pairs]
+def one_by_one(match: Callable[[ScanPair], PairPrediction]) -> Callable[[Loader], Method]:
+    """A baseline that takes one pair."""
+    return lambda load: lambda pairs: [match(pair) for pair in pairs]
 
 
 METHODS: dict[str, Callable[[Loader], Method]] = {
     "joint": lambda load: load().match_pairs,
     "start": lambda load: partial(match_start, load()),
     "static": lambda load: match_static,
-    "background": lambda load: one_by_one("icp", "match_background"),
-    "icp": lambda load: one_by_one("icp", "match_icp"),
-    "ransac": lambda load: one_by_one("ransac", "match_ransac"),
+    **{name: one_by_one(match) for name, match in by_command().items()},
 }
 
 
@@ -105,7 +103,7 @@ def evaluate(
         figures |= _displaced_figures(displacement, seed, scores)
     print("\n".join(table.to_markdown() for table in tables), end="")
     if json is not None:
-        Path(json).write_text(json_format.dumps(figures, indent=2) + "\n")
+        write_whole(Path(json), json_format.dumps(figures, indent=2) + "\n")
     return 0
 
 

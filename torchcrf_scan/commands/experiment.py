@@ -10,7 +10,8 @@ from typing import Any
 import yaml
 from jsonargparse import ArgumentError, ArgumentParser
 
-from torchcrf_scan.learning.settings import Config
+from torchcrf_scan.experiment.parser import config_of, load_yaml, settings_parser
+from torchcrf_scan.experiment.settings import RunConfig
 
 
 def experiment(*, ablations: str | None = None, **settings: Any) -> int:
@@ -20,12 +21,12 @@ def experiment(*, ablations: str | None = None, **settings: Any) -> int:
 
     Args:
         ablations: folder of YAML files, each a variant of the settings; only the joint model is run, one table is printed
-        settings: the fields of `Config`
+        settings: the fields of `RunConfig`
     """
     from torchcrf_scan.experiment.experiment import run_ablations, run_experiment
 
-    config = Config(**{name: value for name, value in settings.items() if name != "config"})
-    if config.first_order != "none" and config.model.encoder.width == 0:
+    config = config_of(settings)
+    if config.has_steps and config.model.encoder.width == 0:
         got = config.first_order
         raise ValueError(f"gradient.objective: expected none in an experiment without model.encoder (it fits in stages), got {got}")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -42,14 +43,12 @@ def experiment(*, ablations: str | None = None, **settings: Any) -> int:
 def experiment_parser(summary: str) -> ArgumentParser:
     """Options: every setting, from YAML files and one by one."""
     usage = "torchcrf-scan experiment [--config CONFIG.yaml] [--ablations FOLDER] --output OUTPUT [settings]"
-    parser = ArgumentParser(description=summary, usage=usage)
-    parser.add_argument("--config", action="config", help="YAML file of settings")
-    parser.add_class_arguments(Config)
+    parser = settings_parser(description=summary, usage=usage)
     parser.add_argument("--ablations", type=str | None, help="folder of YAML files, each a variant: prints one table of them")
     return parser
 
 
-def read_variants(folder: Path, config: Config) -> dict[str, Config]:
+def read_variants(folder: Path, config: RunConfig) -> dict[str, RunConfig]:
     """The variants of `config` in a folder: one a YAML file, or with `experiment.leave_out` one for each feature named there.
 
     Raises:
@@ -58,9 +57,8 @@ def read_variants(folder: Path, config: Config) -> dict[str, Config]:
     files = sorted(folder.glob("*.yaml"))
     if not files:
         raise ValueError(f"--ablations {folder}: expected a folder of .yaml files, got none")
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_class_arguments(Config)
-    variants: dict[str, Config] = {}
+    parser = settings_parser(exit_on_error=False)
+    variants: dict[str, RunConfig] = {}
     config = replace(config, experiment=replace(config.experiment, leave_out=()))
     for file in files:
         variant = read_variant(parser, file, config)
@@ -74,13 +72,13 @@ def read_variants(folder: Path, config: Config) -> dict[str, Config]:
     return variants
 
 
-def read_variant(parser: ArgumentParser, file: Path, config: Config) -> Config:
+def read_variant(parser: ArgumentParser, file: Path, config: RunConfig) -> RunConfig:
     """`config` with the settings of one file changed."""
     try:
-        changes = yaml.safe_load(file.read_text()) or {}
+        changes = load_yaml(file.read_text()) or {}
         if not isinstance(changes, dict):
             raise ValueError(f"expected settings, one a line as NAME: VALUE, got {changes!r}")
         base = parser.parse_object(asdict(config))
-        return Config(**vars(parser.instantiate(parser.parse_object(changes, base))))
+        return config_of(parser.instantiate(parser.parse_object(changes, base)))
     except (ArgumentError, yaml.YAMLError, ValueError, TypeError) as error:
         raise ValueError(f"{file}: {error}") from error

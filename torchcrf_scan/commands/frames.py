@@ -18,7 +18,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction, Uncertainty
-from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.scan import FARTHEST, PairPrediction, ScanPair
 
 Turn = float | Literal["any"]
 
@@ -41,8 +41,8 @@ class FrameOffset:
     turn: Turn
 
     def __post_init__(self) -> None:
-        if not 0 <= self.metres < math.inf:
-            raise ValueError(f"--frame_offset: expected metres, 0 or more, got {self.metres}")
+        if not 0 <= self.metres <= FARTHEST:
+            raise ValueError(f"--frame_offset: expected metres from 0 to {FARTHEST:g}, got {self.metres}")
         if self.turn != "any" and not 0 <= self.turn <= math.pi:
             raise ValueError(f"--frame_turn: expected radians from 0 to pi, or any, got {self.turn}")
 

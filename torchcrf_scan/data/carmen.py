@@ -81,11 +81,6 @@ class CarmenLog(Sequence[ScanPair]):
         return f"{log_name(self.path)}_{number:05d}"
 
 
-def is_log(path: str | Path) -> bool:
-    """Whether a file is a CARMEN log by its name: `.log` or `.log.gz`."""
-    return Path(path).name.endswith((".log", ".log.gz"))
-
-
 def log_name(path: Path) -> str:
     """The name of a recording: the file's, without `.log` and `.gz`."""
     return path.name.removesuffix(".gz").removesuffix(".log")

@@ -170,7 +170,10 @@ def _parse_scan(fields: _Fields, side: str, sensor: dict[str, float | None]) -> 
     fields.require(key, bearings, np.isfinite(bearings), "finite bearings")
     is_sorted = np.diff(bearings, prepend=bearings[:1]) >= 0
     fields.require(key, bearings, is_sorted, "counter-clockwise (non-decreasing) bearings")
-    return Scan.from_ranges(ranges, bearings, **sensor)
+    try:
+        return Scan.from_ranges(ranges, bearings, **sensor)
+    except ValueError as error:
+        raise ValueError(f"{fields.path}: {error}") from error
 
 
 def _parse_annotation(fields: _Fields, source: Scan, target: Scan) -> Annotation | None:

@@ -1,9 +1,12 @@
-"""."""
+"""Settings of the simulator, and the worlds that are made with them."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
+
+from torchcrf_scan.checks import Amount, OneOf, Positive, Share, Within, check_fields
 
 
 @dataclass(frozen=True)
@@ -31,44 +34,31 @@ class SimulatorConfig:
         scale: factor on the whole world and on every motion, but not on the sensor; 0.1 imitates 1:10 model cars.
     """
 
-    scene: str = "street"
-    beams: int = 361
-    fov: float = 180.0
-    range_min: float = 0.1
-    range_max: float = 80.0
-    range_noise: float = 0.015
-    dropout: float = 0.02
-    mixed_pixels: float = 0.12
-    vibration: float = 0.005
-    dt: float = 0.2
-    ego_translation: float = 2.0
-    ego_rotation: float = 0.15
-    movers_min: int = 1
-    movers_max: int = 4
-    clutter: float = 2.0
-    dominant_mover: float = 0.0
-    aperture: float = 0.0
-    scale: float = 1.0
+    scene: Annotated[str, OneOf("street", "indoor")] = "street"
+    beams: Annotated[int, Within(1, 100_000)] = 361
+    fov: Annotated[float, Within(0, 360, above=True)] = 180.0
+    range_min: Amount = 0.1
+    range_max: Annotated[float, Within(0, 1e6, above=True)] = 80.0
+    range_noise: Amount = 0.015
+    dropout: Share = 0.02
+    mixed_pixels: Share = 0.12
+    vibration: Amount = 0.005
+    dt: Positive = 0.2
+    ego_translation: Amount = 2.0
+    ego_rotation: Annotated[float, Within(0, math.pi)] = 0.15
+    movers_min: Annotated[int, Within(0, 1000)] = 1
+    movers_max: Annotated[int, Within(0, 1000)] = 4
+    clutter: Amount = 2.0
+    dominant_mover: Share = 0.0
+    aperture: Share = 0.0
+    scale: Positive = 1.0
 
     def __post_init__(self) -> None:
-        shares = ("dropout", "mixed_pixels", "dominant_mover", "aperture")
-        amounts = ("range_min", "range_noise", "vibration", "ego_translation", "clutter")
-        rules = {
-            "scene": (self.scene in ("street", "indoor"), "street or indoor"),
-            "beams": (self.beams >= 1, "at least 1"),
-            "fov": (0 < self.fov <= 360, "above 0 and at most 360 degrees"),
-            "range_max": (self.range_min < self.range_max < math.inf, f"a finite range above range_min = {self.range_min}"),
-            "dt": (0 < self.dt < math.inf, "a finite time above 0"),
-            "ego_rotation": (0 <= self.ego_rotation <= math.pi, "radians between 0 and pi"),
-            "movers_min": (self.movers_min >= 0, "at least 0"),
-            "movers_max": (self.movers_max >= self.movers_min, f"at least movers_min = {self.movers_min}"),
-            "scale": (0 < self.scale < math.inf, "a finite factor above 0"),
-        }
-        rules |= {name: (0 <= getattr(self, name) <= 1, "a share between 0 and 1") for name in shares}
-        rules |= {name: (0 <= getattr(self, name) < math.inf, "a finite number of at least 0") for name in amounts}
-        for name, (is_met, expected) in rules.items():
-            if not is_met:
-                raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
+        check_fields(self)
+        if self.range_max <= self.range_min:
+            raise ValueError(f"range_max: expected more than range_min = {self.range_min}, got {self.range_max}")
+        if self.movers_max < self.movers_min:
+            raise ValueError(f"movers_max: expected at least movers_min = {self.movers_min}, got {self.movers_max}")
 
 
 MODEL_CARS = SimulatorConfig(beams=360, fov=360.0, range_max=9.0, dropout=0.3, scale=0.1, ego_translation=4.0, ego_rotation=0.25)

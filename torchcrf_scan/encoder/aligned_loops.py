@@ -1,4 +1,4 @@
-"""What the encoder sees of the points, `encoder.aligned` in loops: one scan at a time, point by point."""
+"""Input channels of the encoder, one scan at a time, point by point; `encoder.aligned` without batches."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 from torch import Tensor
 
 from torchcrf_scan.encoder.channels import BESIDE, CHANNELS, FARTHEST, LARGEST_TURN, LONGEST_CHORD, NEAR, NOWHERE, PROFILE, WINDOW
-from torchcrf_scan.fast.free_space import Sweep, look, sweep_of
-from torchcrf_scan.loops.circle import first_from, turn_between, within_circle
+from torchcrf_scan.fast.free_space import Sweep, beam_after, look, sweep_of
+from torchcrf_scan.loops.circle import turn_between
 from torchcrf_scan.loops.jit import Array, Booleans, kernel
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.pair import Pair, PairStart, padded
+from torchcrf_scan.loops.rigid import inverse, transform, transform_of
 from torchcrf_scan.loops.threads import for_each
 
 WIDTH = len(CHANNELS)
@@ -31,7 +32,7 @@ def along_scan(sweep: Sweep, place: int) -> int:
 
 @kernel
 def fill_own(sweep: Sweep, i: int, unit: float, usual: float, channels: Array) -> None:
-    """What a scan says of its own point i. channels: (F,)."""
+    """Writes the channels of point i that its own scan determines. channels: (F,)."""
     f = 0
     for k in BESIDE:
         beside = along_scan(sweep, i + k)
@@ -46,15 +47,6 @@ def fill_own(sweep: Sweep, i: int, unit: float, usual: float, channels: Array) -
         f += 1
     channels[f] = min(math.log(unit / max(sweep.noise, 1e-9)), 8.0) / 2 - 1
     channels[f + 1] = min(max(math.log(max(sweep.ranges[i], 1e-9) / max(usual, 1e-9)), -3.0), 3.0)
-
-
-@kernel
-def beam_after(sweep: Sweep, x: float, y: float) -> tuple[float, int]:
-    """The bearing of a point in a scan's frame on the scale of the scan's own, and the first beam that is not before it."""
-    first = sweep.bearings[0] if len(sweep.bearings) > 0 else 0.0
-    half = sweep.step / 2
-    bearing = first + within_circle(math.atan2(y - sweep.origin[1], x - sweep.origin[0]) - first + half) - half
-    return bearing, first_from(sweep.bearings, bearing)
 
 
 @kernel
@@ -90,9 +82,9 @@ def surface_about(sweep: Sweep, points: Array, x: float, y: float, after: int, u
 
 @kernel
 def fill_cross(sweep: Sweep, points: Array, x: float, y: float, unit: float, channels: Array) -> float:
-    """What the other scan says of a point in its frame; returns the units to its nearest point. channels: (F,)."""
-    bearing, after = beam_after(sweep, x, y)
+    """Writes the channels of a point in the other scan's frame; returns the units to the nearest point there. channels: (F,)."""
     dx, dy = x - sweep.origin[0], y - sweep.origin[1]
+    bearing, after = beam_after(sweep, dx, dy)
     reach = math.sqrt(dx * dx + dy * dy)
     for k in range(-PROFILE, PROFILE):
         j = along_scan(sweep, after + k)
@@ -119,7 +111,7 @@ def channels_of(
     P, C = len(points), len(motions)
     channels = np.zeros((P, WIDTH))
     usual = lower_median(sweep.ranges.copy()) if P > 0 else 1.0
-    cos, sin = np.cos(motions[:, 0]), np.sin(motions[:, 0])
+    transforms = [transform_of(motions[c]) for c in range(C)]
     for i in range(P):
         unit = max(sweep.noise + sweep.ranges[i] * sweep.step, 1e-9)
         fill_own(sweep, i, unit, usual, channels[i])
@@ -128,13 +120,13 @@ def channels_of(
             is_there = log_odds[c] > -np.inf and (c == 0 or len(reach) == 0 or reach[i, c])
             if c > 0 and not is_there:
                 continue
-            x = cos[c] * points[i, 0] - sin[c] * points[i, 1] + motions[c, 1]
-            y = sin[c] * points[i, 0] + cos[c] * points[i, 1] + motions[c, 2]
+            x, y = transform(transforms[c], points[i, 0], points[i, 1])
             if c == 0:
                 background = fill_cross(other_sweep, other, x, y, unit, channels[i])
                 channels[i, OWN + CROSS], channels[i, OWN + CROSS + 1] = look(other_sweep, x, y)
                 continue
-            distance = nearest_about(other_sweep, other, x, y, beam_after(other_sweep, x, y)[1], unit)
+            after = beam_after(other_sweep, x - other_sweep.origin[0], y - other_sweep.origin[1])[1]
+            distance = nearest_about(other_sweep, other, x, y, after, unit)
             if len(reach) > 0 or distance < NEAR:
                 best = min(best, distance)
                 sure = max(sure, math.exp(-distance / 2) / (1 + math.exp(-log_odds[c])))
@@ -145,23 +137,15 @@ def channels_of(
 
 
 @kernel
-def back_of(motions: Array) -> Array:
-    """(C, 3) the inverse motions."""
-    back = np.empty_like(motions)
-    for c in range(len(motions)):
-        theta, tx, ty = motions[c]
-        cos, sin = math.cos(theta), math.sin(theta)
-        back[c, 0], back[c, 1], back[c, 2] = -theta, -cos * tx - sin * ty, sin * tx - cos * ty
-    return back
-
-
-@kernel
 def channels_of_side(pair: Pair, motions: Array, log_odds: Array, reach: Booleans, is_target: bool) -> Array:
     """(N, F) of the source, or (M, F) of the target. motions: (C, 3); log_odds: (C,); reach: (N, C)."""
     source = sweep_of(pair.source, pair.noise, pair.source_closed, np.zeros(2))
     target = sweep_of(pair.target, pair.noise, pair.target_closed, pair.target_origin)
     if is_target:
-        return channels_of(pair.target, target, pair.source, source, back_of(motions), log_odds, reach[:0])
+        back = np.empty_like(motions)
+        for c in range(len(motions)):
+            back[c] = inverse(motions[c])
+        return channels_of(pair.target, target, pair.source, source, back, log_odds, reach[:0])
     return channels_of(pair.source, source, pair.target, target, motions, log_odds, reach)
 
 
@@ -170,11 +154,11 @@ def aligned_inputs_of_pairs(
 ) -> tuple[Tensor, ...]:
     """`encoder.aligned.aligned_inputs` of some pairs, in double precision, padded to so many source and target points."""
 
-    def look(b: int) -> list[Array]:
+    def channels_of_pair(b: int) -> list[Array]:
         pair, start = pairs[b], starts[b]
         log_odds = start.log_odds if len(start.log_odds) else np.where(start.active, np.inf, -np.inf)
         sides = (False, True) if both else (False,)
         return [channels_of_side(pair, start.motions, log_odds, start.reach, is_target) for is_target in sides]
 
-    found = for_each(look, range(len(pairs)))
+    found = for_each(channels_of_pair, range(len(pairs)))
     return tuple(padded([of[k] for of in found], (lengths[k], WIDTH), 0.0) for k in range(1 + both))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from torchcrf_scan.counterparts import match_movers, relabel
+from torchcrf_scan.evaluation.counterparts import match_movers, relabel
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, Bools, Floats, PairPrediction, ScanPair
 

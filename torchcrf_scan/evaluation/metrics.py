@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from rapidfuzz.distance import Levenshtein
 
-from torchcrf_scan.counterparts import match_movers, relabel
 from torchcrf_scan.evaluation.calibration import Sureness
+from torchcrf_scan.evaluation.counterparts import match_movers, relabel
+from torchcrf_scan.evaluation.measures import EVERY, Count, Labelled
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 
@@ -102,9 +103,7 @@ class PairScore:
         association: score of the associations.
         cluster: score of the cluster labels after matching.
         within_1, within_2: points at most 1, 2 target beams off; an outlier must be called one.
-        inliers, inliers_right: points with a counterpart, and those associated exactly (A-27).
-        distance_sum, distance_points: summed distance (metres) between the predicted and the true target return, over the
-            points that have both.
+        counts: part and whole of every one of `measures.EVERY`.
         moving_both, moving_either: points moving by truth and prediction, by truth or prediction, among those whose `body` counts.
         has_ego_truth: whether the background's true motion is known.
         ego_rotation, ego_translation: error of the background motion, radians and metres; NaN when it or its truth is unknown.
@@ -117,10 +116,7 @@ class PairScore:
     cluster: LabelScore
     within_1: int
     within_2: int
-    inliers: int
-    inliers_right: int
-    distance_sum: float
-    distance_points: int
+    counts: dict[str, Count] = field(hash=False)
     moving_both: int
     moving_either: int
     has_ego_truth: bool
@@ -149,7 +145,7 @@ def score_pair(pair: ScanPair, prediction: PairPrediction) -> PairScore:
     points = pair.source.to_beams(pair.source.points, np.nan)[keep]
 
     offset = _index_offset(association, predicted_association)
-    distances = _target_distances(pair, association, predicted_association)
+    labels = Labelled(pair, association, cluster, truth.body[keep], predicted_association, predicted_cluster)
     matched = match_movers(cluster, predicted_cluster)
     moving = _moving(truth.body[keep], predicted_cluster)
     has_ego_truth, rotation, translation = _ego_error(truth.motions[0], _motion(prediction, BACKGROUND))
@@ -158,10 +154,7 @@ def score_pair(pair: ScanPair, prediction: PairPrediction) -> PairScore:
         cluster=_label_score(cluster, relabel(predicted_cluster, cluster, matched)),
         within_1=int((offset <= 1).sum()),
         within_2=int((offset <= 2).sum()),
-        inliers=int((association >= 0).sum()),
-        inliers_right=int(((association >= 0) & (offset == 0)).sum()),
-        distance_sum=float(distances.sum()),
-        distance_points=len(distances),
+        counts={key: measure.count(labels) for key, measure in EVERY.items()},
         moving_both=moving[0],
         moving_either=moving[1],
         has_ego_truth=has_ego_truth,
@@ -196,14 +189,6 @@ def _index_offset(association: Ints, predicted: Ints) -> Floats:
     is_outlier, is_predicted = association < 0, predicted < 0
     offset = np.where(is_outlier != is_predicted, np.inf, np.abs(association - predicted))
     return np.where(is_outlier & is_predicted, 0.0, offset)
-
-
-def _target_distances(pair: ScanPair, association: Ints, predicted: Ints) -> Floats:
-    """Distances between the true and the predicted target return, metres, where both exist."""
-    targets = pair.target.to_beams(pair.target.points, np.nan)
-    both = (association >= 0) & (predicted >= 0)
-    distances = np.linalg.norm(targets[association[both]] - targets[predicted[both]], axis=-1)
-    return distances[np.isfinite(distances)]
 
 
 def _label_score(labels: Ints, predicted: Ints) -> LabelScore:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 from torchcrf_scan.evaluation import published as paper
 from torchcrf_scan.evaluation.bootstrap import Interval, paired_intervals
+from torchcrf_scan.evaluation.measures import MEASURES
 from torchcrf_scan.evaluation.metrics import PairScore
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.scan import Ints
@@ -53,17 +54,22 @@ def _label_columns(prefix: str) -> tuple[Column, ...]:
     )
 
 
+def _counted(table: str) -> tuple[Column, ...]:
+    """The columns of a table that `MEASURES` names."""
+    return tuple((measure.heading, key, measure.digits) for key, measure in MEASURES[table].items())
+
+
 ASSOCIATION: tuple[Column, ...] = (
     *_label_columns("association"),
     ("within +-1 (%)", "association_within_1", 2),
     ("within +-2 (%)", "association_within_2", 2),
-    ("inliers only (%)", "association_inlier_accuracy", 2),
-    ("target distance (m)", "target_distance", 3),
+    *_counted("association"),
 )
 DETECTION: tuple[Column, ...] = (
     *_label_columns("cluster"),
     ("IoU of moving points (%)", "iou_moving", 2),
     ("movers found (%)", "movers_found", 2),
+    *_counted("detection"),
 )
 ESTIMATION: tuple[Column, ...] = (
     ("rotation (rad)", "motion_rotation", 4),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcrf_scan.evaluation.calibration import consistency, expected_calibration_error
+from torchcrf_scan.evaluation.measures import EVERY, Count
 from torchcrf_scan.evaluation.metrics import LabelScore, ObjectScore, PairScore
 
 EGO_TRANSLATION, EGO_ROTATION = 0.05, 0.01745  # metres, radians (1 deg): a good ego motion
@@ -47,6 +48,7 @@ def summarise(scores: Sequence[PairScore]) -> dict[str, float]:
         **_ego_summary(scores),
         **_motion_summary(scores),
         **_sureness_summary(scores),
+        **_counted_summary(scores),
     }
 
 
@@ -61,11 +63,11 @@ def _mean(values: Iterable[float]) -> float:
     return float(array.mean()) if len(array) else float("nan")
 
 
-def _mean_percent(counts: Sequence[tuple[int, int]]) -> float:
+def _mean_percent(counts: Sequence[Count]) -> float:
     return _mean(_percent(part, whole) for part, whole in counts)
 
 
-def _both_means(key: str, counts: Sequence[tuple[int, int]]) -> dict[str, float]:
+def _both_means(key: str, counts: Sequence[Count]) -> dict[str, float]:
     """Mean percentage of (part, whole) with 0 for an undefined one, and with those skipped."""
     return {key: _mean_percent(counts), f"{key}_skipped": _mean_percent([count for count in counts if count[1]])}
 
@@ -83,15 +85,24 @@ def _label_summary(prefix: str, labels: Sequence[LabelScore]) -> dict[str, float
 
 
 def _association_summary(scores: Sequence[PairScore]) -> dict[str, float]:
-    distance_points = sum(score.distance_points for score in scores)
-    distance_sum = sum(score.distance_sum for score in scores)
     return {
         **_label_summary("association", [score.association for score in scores]),
         "association_within_1": _mean_percent([(score.within_1, score.association.points) for score in scores]),
         "association_within_2": _mean_percent([(score.within_2, score.association.points) for score in scores]),
-        **_both_means("association_inlier_accuracy", [(score.inliers_right, score.inliers) for score in scores]),
-        "target_distance": distance_sum / distance_points if distance_points else float("nan"),
     }
+
+
+def _counted_summary(scores: Sequence[PairScore]) -> dict[str, float]:
+    """The figures of `measures.MEASURES`."""
+    found: dict[str, float] = {}
+    for key, measure in EVERY.items():
+        counts = [score.counts[key] for score in scores]
+        if measure.is_pooled:
+            part, whole = (sum(numbers) for numbers in zip(*counts, strict=True))
+            found[key] = part / whole if whole else float("nan")
+        else:
+            found |= _both_means(key, counts)
+    return found
 
 
 def _moving_summary(scores: Sequence[PairScore]) -> dict[str, float]:

@@ -1,0 +1,1 @@
+"""The paper's experiment: folds, every method on every fold, tables and ablations."""

@@ -5,6 +5,7 @@ A finished fold is a folder `PROTOCOL/FOLD/` with `METHOD/PAIR.npz` predictions 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import pickle
@@ -24,11 +25,14 @@ from joblib import Parallel, cpu_count, delayed
 from tqdm import tqdm
 
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
-from torchcrf_scan.experiment.methods import METHODS, Answer, Study, answer, fit_models
-from torchcrf_scan.learning.settings import Config
+from torchcrf_scan.experiment.methods import METHODS, Answer, answer
+from torchcrf_scan.experiment.models import fit_models
+from torchcrf_scan.experiment.settings import RunConfig
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 SECONDS = "seconds.json"
+LONGEST = 100  # bytes of a name that files are named by; of a longer one the beginning and a digest
 PATIENCE = timedelta(days=7)  # that a machine waits for the others' folds
 
 
@@ -74,12 +78,14 @@ def make_folds(protocol: str, pairs: Sequence[ScanPair], tested: int, every: int
 
 
 def file_name(name: str) -> str:
-    """A name as part of a path."""
-    return re.sub(r"[^\w.+-]+", "_", name).strip("_") or "unnamed"
+    """A name as part of a path: never one that leads elsewhere (`..`), nor one that is too long for a file."""
+    whole = name.encode(errors="surrogatepass")
+    short = name if len(whole) <= LONGEST else f"{name[: LONGEST // 4]}_{hashlib.sha256(whole).hexdigest()[:12]}"
+    return re.sub(r"[^\w.+-]+", "_", short).strip("_.") or "unnamed"
 
 
 def run_folds(
-    make_study: Callable[[int], Study], folds: Mapping[str, Sequence[Fold]], config: Config, folder: Path, jobs: int
+    make_study: Callable[[int], Study], folds: Mapping[str, Sequence[Fold]], config: RunConfig, folder: Path, jobs: int
 ) -> None:
     """Runs the folds that `folder` lacks; under `torchrun` every rank takes its share and rank 0 ends up with all of them.
 
@@ -115,7 +121,7 @@ def run_fold(study_file: Path, protocol: str, fold: Fold, folder: Path) -> None:
 
 
 @lru_cache(maxsize=1)
-def load_study(place: Path) -> tuple[Study, Config]:
+def load_study(place: Path) -> tuple[Study, RunConfig]:
     """The study of this run, written by the process that started it; a worker reads it once."""
     study, config = pickle.loads(place.read_bytes())
     return study, config

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from torchcrf_scan.baselines.libraries import LIBRARIES, installed_libraries
+from torchcrf_scan.baselines.register import BASELINES, installed
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import WORLDS
@@ -22,11 +22,13 @@ from torchcrf_scan.evaluation.report import Scores, Table, differences_table, re
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.experiment.ablation import ablation_table
 from torchcrf_scan.experiment.cross_validation import Results, cores, file_name, make_folds, rank_and_world, read_folds, run_folds
-from torchcrf_scan.experiment.methods import ENCODED, EXACT, JOINT, Study
+from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT
+from torchcrf_scan.experiment.settings import RunConfig
+from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning.run_log import RunLog
-from torchcrf_scan.learning.settings import Config
 from torchcrf_scan.scan import Ints, PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_associations, plot_clusters, save_figure
+from torchcrf_scan.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +42,7 @@ LOSSES = 3  # pictures of the pairs where the joint model loses most against the
 ABLATED = "leave_one_sequence_out"
 
 
-def run_experiment(config: Config) -> dict[str, list[Table]]:
+def run_experiment(config: RunConfig) -> dict[str, list[Table]]:
     """Runs the folds that the output folder lacks, then makes every table and figure.
 
     Returns:
@@ -56,7 +58,7 @@ def run_experiment(config: Config) -> dict[str, list[Table]]:
         protocol: make_folds(protocol, pairs, tested, config.experiment.test_every) for protocol in config.experiment.protocols
     }
     claim(folder, config, pairs)
-    for name in sorted(set(LIBRARIES) - set(installed_libraries())):
+    for name in sorted(set(BASELINES) - set(installed())):
         log.info("row left out, not installed: %s (pip install torchcrf-scan[bench])", name)
     run_folds(lambda jobs: Study.of(pairs, config, jobs), folds, config, folder / "folds", cores(config.experiment.jobs))
     if rank_and_world()[0] != 0:
@@ -72,33 +74,20 @@ def run_experiment(config: Config) -> dict[str, list[Table]]:
     return tables
 
 
-def run_ablations(config: Config, variants: Mapping[str, Config]) -> list[Table]:
+def run_ablations(config: RunConfig, variants: Mapping[str, RunConfig]) -> list[Table]:
     """The joint model under every variant of `config`, sequences left out in turn, beside the model of `config` itself.
 
     variants: name -> its config. Returns one table; none on the ranks that only help. Raises ValueError as `run_experiment`.
     """
-    folder = Path(config.output) / "ablations"
-    studies: dict[str, Study] = {}
-    scores, seconds, jobs = {}, {}, cores(config.experiment.jobs)
     pairs, tested = load_pairs(config)
-    for name, variant in {"as configured": config, **variants}.items():
-        every = math.lcm(config.experiment.test_every, variant.experiment.test_every)  # of the pairs that the model is tested on
-        experiment = replace(variant.experiment, joint_alone=True, protocols=(ABLATED,), test_every=every)
-        variant = replace(variant, experiment=experiment, output=str(folder / file_name(name)))
-        folds = make_folds(ABLATED, pairs, tested, experiment.test_every)
-        claim(Path(variant.output), variant, pairs)
-        looked_at = json.dumps([variant.learning.seed, variant.learning.disturbance])
-
-        def study(jobs: int, variant: Config = variant, looked_at: str = looked_at) -> Study:
-            if looked_at not in studies:
-                studies[looked_at] = Study.of(pairs, variant, jobs)
-            return studies[looked_at]
-
-        log.info("%s", name)
-        run_folds(study, {ABLATED: folds}, variant, Path(variant.output) / "folds", jobs)
-        if rank_and_world()[0] == 0:
-            found = read_folds(Path(variant.output) / "folds" / ABLATED, pairs, folds)
-            scores[name], seconds[name] = score(found)[JOINT], found.seconds[JOINT]
+    scores, seconds = {}, {}
+    with TemporaryDirectory() as kept:
+        looks = Looks(pairs, Path(kept))
+        for name, variant in {"as configured": config, **variants}.items():
+            log.info("%s", name)
+            found = run_variant(config, ablated(config, variant, name), looks, tested)
+            if found is not None:
+                scores[name], seconds[name] = score(found)[JOINT], found.seconds[JOINT]
     if rank_and_world()[0] != 0:
         return []
     tables = [ablation_table(scores, seconds, lambda of: resample(of, config))]
@@ -106,7 +95,40 @@ def run_ablations(config: Config, variants: Mapping[str, Config]) -> list[Table]
     return tables
 
 
-def load_pairs(config: Config) -> tuple[list[ScanPair], int]:
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """Studies of the same pairs, made when first asked for. kept: folder of what their variants share."""
+
+    pairs: Sequence[ScanPair]
+    kept: Path
+    studies: dict[str, Study] = field(default_factory=dict)
+
+    def study(self, config: RunConfig, jobs: int) -> Study:
+        """The study of a variant; variants that see the pairs alike share one."""
+        looked_at = json.dumps([config.learning.seed, config.learning.disturbance])
+        if looked_at not in self.studies:
+            self.studies[looked_at] = replace(Study.of(self.pairs, config, jobs), kept=self.kept)
+        return self.studies[looked_at]
+
+
+def ablated(config: RunConfig, variant: RunConfig, name: str) -> RunConfig:
+    """A variant as the ablations run it: the joint model alone, on the pairs that the model of `config` is tested on."""
+    every = math.lcm(config.experiment.test_every, variant.experiment.test_every)
+    experiment = replace(variant.experiment, joint_alone=True, protocols=(ABLATED,), test_every=every)
+    return replace(variant, experiment=experiment, output=str(Path(config.output) / "ablations" / file_name(name)))
+
+
+def run_variant(config: RunConfig, variant: RunConfig, looks: Looks, tested: int) -> Results | None:
+    """Runs the folds of one variant; None on the ranks that only help."""
+    pairs, folder = looks.pairs, Path(variant.output)
+    folds = make_folds(ABLATED, pairs, tested, variant.experiment.test_every)
+    claim(folder, variant, pairs)
+    jobs = cores(config.experiment.jobs)
+    run_folds(lambda jobs: looks.study(variant, jobs), {ABLATED: folds}, variant, folder / "folds", jobs)
+    return read_folds(folder / "folds" / ABLATED, pairs, folds) if rank_and_world()[0] == 0 else None
+
+
+def load_pairs(config: RunConfig) -> tuple[list[ScanPair], int]:
     """The annotated pairs, those that are left out in turn first, and how many these are."""
     experiment, data = config.experiment, config.data
     patterns = (experiment.pairs,) if isinstance(experiment.pairs, str) else experiment.pairs
@@ -117,14 +139,14 @@ def load_pairs(config: Config) -> tuple[list[ScanPair], int]:
     return [*tested, *simulate(experiment.also_train, config, data.seed + ALSO_TRAIN_SEED)], len(tested)
 
 
-def simulate(worlds: Sequence[str], config: Config, seed: int) -> list[ScanPair]:
+def simulate(worlds: Sequence[str], config: RunConfig, seed: int) -> list[ScanPair]:
     """Pairs of every named world, their names told apart by its number."""
     data = config.data
     found = [simulate_pairs(WORLDS[world], data.pairs, data.sequences, seed + k) for k, world in enumerate(worlds)]
     return [replace(pair, name=f"{seed + k}_{pair.name}") for k, of_world in enumerate(found) for pair in of_world]
 
 
-def claim(folder: Path, config: Config, pairs: Sequence[ScanPair]) -> None:
+def claim(folder: Path, config: RunConfig, pairs: Sequence[ScanPair]) -> None:
     """Makes the folder this experiment's; refuses (ValueError) one whose folds were made with other settings or pairs."""
     values = asdict(config)
     for name in ("output", "overfit", "compare_chains"):
@@ -182,13 +204,13 @@ def score(results: Results) -> dict[str, list[PairScore]]:
     }
 
 
-def resample(scores: Sequence[PairScore], config: Config) -> Ints:
+def resample(scores: Sequence[PairScore], config: RunConfig) -> Ints:
     """(R, P) bootstrap weights: over sequences for simulated pairs, over blocks of neighbours in time for recorded ones."""
     draw = by_blocks if config.experiment.pairs else by_sequence
     return draw([one.sequence for one in scores], resamples=config.experiment.resamples)
 
 
-def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: str, config: Config, run: RunLog) -> list[Table]:
+def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: str, config: RunConfig, run: RunLog) -> list[Table]:
     """Overview, Tables I to III, how sure and the differences of one protocol, logged as well."""
     tables = report(scores, seconds=seconds, published=True)
     weights = resample(scores[JOINT], config)
@@ -237,10 +259,3 @@ def write_tables(folder: Path, name: str, tables: Sequence[Table]) -> None:
     write_whole(folder / f"{name}.md", "\n\n".join(table.to_markdown() for table in tables) + "\n")
     for table in tables:
         write_whole(folder / f"{name}_{file_name(table.title.split(' (')[0].split(':')[0])}.csv".lower(), table.to_csv())
-
-
-def write_whole(path: Path, content: str) -> None:
-    """The file appears whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(content)
-    os.replace(temporary, path)

@@ -1,11 +1,13 @@
-"""."""
+"""Settings of the paper's experiment, beside those of a training run."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated
 
-from torchcrf_scan.checks import choose
-from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.checks import OneOf, Within, check_fields
+from torchcrf_scan.learning.settings import Config, Count, World
+from torchcrf_scan.names import WEIGHTS
 
 
 @dataclass(frozen=True)
@@ -27,22 +29,30 @@ class ExperimentConfig:
     """
 
     pairs: tuple[str, ...] | str = ()
-    worlds: tuple[str, ...] = ("street",)
-    also_train: tuple[str, ...] = ()
-    protocols: tuple[str, ...] = ("leave_one_pair_out", "leave_one_sequence_out")
+    worlds: tuple[World, ...] = ("street",)
+    also_train: tuple[World, ...] = ()
+    protocols: tuple[Annotated[str, OneOf("leave_one_pair_out", "leave_one_sequence_out")], ...] = (
+        "leave_one_pair_out",
+        "leave_one_sequence_out",
+    )
     joint_alone: bool = False
-    test_every: int = 1
-    leave_out: tuple[str, ...] = ()
+    test_every: Count = 1
+    leave_out: tuple[Annotated[str, OneOf(*WEIGHTS)], ...] = ()
     joint_variants: bool = True
     figures: tuple[str, ...] = ()
-    resamples: int = 2000
-    jobs: int = 0
+    resamples: Count = 2000
+    jobs: Annotated[int, Within(0, 1000)] = 0
 
     def __post_init__(self) -> None:
-        for world in (*self.worlds, *self.also_train):
-            choose("worlds", world, tuple(WORLDS))
-        for protocol in self.protocols:
-            choose("protocols", protocol, ("leave_one_pair_out", "leave_one_sequence_out"))
-        for name, least in (("test_every", 1), ("resamples", 1), ("jobs", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+        check_fields(self, "experiment.")
+
+
+@dataclass(frozen=True)
+class RunConfig(Config):
+    """Everything in a configuration file: one run of `train.py` or of `torchcrf-scan experiment`.
+
+    Attributes:
+        experiment: what `torchcrf-scan experiment` does; `train.py` does not look at it.
+    """
+
+    experiment: ExperimentConfig = field(default_factory=ExperimentConfig)

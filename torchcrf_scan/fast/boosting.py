@@ -26,7 +26,7 @@ class Stumps(NamedTuple):
 
 
 def double_array(values: Tensor) -> Array:
-    """What was learned, as the loops take it."""
+    """The tensor as a contiguous array in double precision, a copy."""
     return np.ascontiguousarray(values.detach().cpu().double().numpy().copy())
 
 

@@ -1,13 +1,12 @@
-"""The target points that a source point may have become; `features.candidates` for one pair, by a search, not all distances."""
+"""Candidate target points of every source point; `features.candidates` for one pair, by a search, not all distances."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.nearest import RUN, Boxes, box_distance, nearest
+from torchcrf_scan.loops.rigid import apply
 
 
 @kernel
@@ -20,12 +19,7 @@ def under_motions(source: Array, motions: Array, active: Booleans) -> tuple[Arra
             A += 1
     moved = np.empty((A, len(source), 2))
     for a in range(A):
-        motion = motions[which[a]]
-        cos, sin = math.cos(motion[0]), math.sin(motion[0])
-        for i in range(len(source)):
-            x, y = source[i, 0], source[i, 1]
-            moved[a, i, 0] = cos * x - sin * y + motion[1]
-            moved[a, i, 1] = sin * x + cos * y + motion[2]
+        moved[a] = apply(motions[which[a]], source)
     return moved, which[:A]
 
 
@@ -51,7 +45,7 @@ def _insert(distance: float, j: int, last: int, squared: Array, index: Integers)
 
 @kernel
 def _improve(boxes: Boxes, moved: Array, i: int, member: Integers, squared: Array, index: Integers, guess: Integers) -> None:
-    """Takes into the list (K,) of source point i what is nearer than its last, and finds the nearest point under every motion.
+    """Improves the list (K,) of source point i to its nearest points, and finds the nearest point under every motion.
 
     member: (M,) is i for the points in the list. guess: (A,) a point that may be the nearest, and afterwards is; the first of them.
     """

@@ -6,15 +6,6 @@ import torch
 
 from torchcrf_scan.config import ModelConfig
 
-KNOWN_SETTINGS = {  # of `InferenceConfig` and `ModelConfig`: what the loops know
-    "candidate_search": ("motion",),
-    "schedule": ("sweep",),
-    "temperature": (0.0,),
-    "motion_weights": ("hard",),
-    "chains": ("joint",),
-    "coupling": ("motions",),
-}
-
 
 def can_run(backend: str, device: torch.device) -> bool:
     """Whether loops may take the place of tensors that have no gradient, on a device.
@@ -30,10 +21,10 @@ def can_decode(model: ModelConfig, device: torch.device, *, needs_gradient: bool
 
     has_embeddings: some were given, or the model's encoder makes them.
     """
-    inference = model.inference
-    chosen = {name: getattr(inference if hasattr(inference, name) else model, name) for name in KNOWN_SETTINGS}
-    unknown = [f"{name}: {chosen[name]}" for name, known in KNOWN_SETTINGS.items() if chosen[name] not in known]
+    unknown = [f"{name}: {value}" for name, value in model.without("in_loops").items()]
     reason = _why_not_here(device)
+    if model.inference.temperature > 0:
+        unknown.append(f"temperature: {model.inference.temperature}")
     if model.features.smooth > 0:
         unknown.append(f"smooth: {model.features.smooth}")
     if unknown:
@@ -42,11 +33,11 @@ def can_decode(model: ModelConfig, device: torch.device, *, needs_gradient: bool
         reason = "no embeddings, got some (backend eager or auto takes them)"
     elif needs_gradient:
         reason = "no gradient to be asked for (torch.no_grad)"
-    return _decide(inference.backend, reason)
+    return _decide(model.inference.backend, reason)
 
 
 def _why_not_here(device: torch.device) -> str | None:
-    """What the loops would need, where they cannot run."""
+    """What the loops need, where they cannot run; else None."""
     if torch.compiler.is_compiling():
         return "an ordinary call, not a compiled or exported one"
     return f"scans on the CPU, got {device}" if device.type != "cpu" else None

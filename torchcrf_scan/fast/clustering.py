@@ -1,7 +1,7 @@
 """The clustering chain of one pair: potentials without feature tensors, and an exact pass.
 
-`features.clustering`, `features.extension` and `features.potentials` in loops: the weights are applied on the fly, and only
-clusters that exist cost anything.
+The potentials are those of `features.clustering`, `features.extension` and `features.potentials`; the weights are applied on the
+fly, and only clusters that exist cost anything.
 """
 
 from __future__ import annotations
@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from torchcrf_scan.fast.free_space import Sweep, look
-from torchcrf_scan.features.scales import CLUSTERING_WEIGHTS, GATE_WIDTH, KAPPA
+from torchcrf_scan.fast.robust import robust_square
+from torchcrf_scan.features.scales import GATE_WIDTH
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.messages import max_marginals
 from torchcrf_scan.loops.nearest import Boxes, nearest
-from torchcrf_scan.loops.rigid import inverse
+from torchcrf_scan.loops.rigid import inverse, transform, transform_of
+from torchcrf_scan.names import CLUSTERING_WEIGHTS
 
 if TYPE_CHECKING:
     from torchcrf_scan.inference.state import Parameters
@@ -48,7 +50,7 @@ class ClusteringWeights(NamedTuple):
 
 
 class ClusteringModel(NamedTuple):
-    """What was learned of the clustering chain; the scales are those of `features.scales.Scales`."""
+    """Fitted weights and scales of the clustering chain; the scales are those of `features.scales.Scales`."""
 
     weights: ClusteringWeights
     cluster_distance: float
@@ -59,7 +61,7 @@ class ClusteringModel(NamedTuple):
 
 
 def clustering_model(parameters: Parameters) -> ClusteringModel:
-    """The learned numbers out of their tensors."""
+    """The fitted weights and scales as numbers."""
     weights = dict(zip(CLUSTERING_WEIGHTS, parameters.clustering.detach().double().tolist(), strict=True))
     scales = parameters.scales
     return ClusteringModel(
@@ -73,7 +75,7 @@ def clustering_model(parameters: Parameters) -> ClusteringModel:
 
 
 class Tables(NamedTuple):
-    """Everything of the chain's potentials at some motions and associations; any of the clusters may still be left out.
+    """Potentials of the chain at some motions and associations, before any of the clusters is left out.
 
     Attributes:
         moved: (C, N, 2) source points under every motion.
@@ -93,12 +95,6 @@ class Tables(NamedTuple):
 
 
 @kernel
-def capped_square(error: float, scale: float) -> float:
-    """`features.scales.robust_square`."""
-    return -min((error / scale) ** 2, KAPPA)
-
-
-@kernel
 def distance(dx: float, dy: float) -> float:
     """Length of a vector; `hypot` guards against overflow, which takes several times as long."""
     return math.sqrt(dx * dx + dy * dy)
@@ -115,12 +111,10 @@ def nearest_to_outliers(boxes: Boxes, source: Array, motions: Array, active: Boo
     for c in range(len(motions)):
         if not active[c]:
             continue
-        cos, sin = math.cos(motions[c, 0]), math.sin(motions[c, 0])
-        guess = 0
+        by, guess = transform_of(motions[c]), 0
         for i in range(len(source)):
             if association[i] < 0:
-                x = cos * source[i, 0] - sin * source[i, 1] + motions[c, 1]
-                y = sin * source[i, 0] + cos * source[i, 1] + motions[c, 2]
+                x, y = transform(by, source[i, 0], source[i, 1])
                 guess = nearest(boxes, x, y, guess)[1]
                 index[i, c] = guess
     return index
@@ -142,7 +136,7 @@ def edge_potentials(source: Array, target: Array, association: Integers, model: 
             stretch = distance(target[b, 0] - target[a, 0], target[b, 1] - target[a, 1]) - length[i]
             stiff = math.exp(-((stretch / model.neighbour_distance) ** 2))
             same[i] += w.neighbour_stiffness_same * stiff
-            same[i] += w.neighbour_distance_same * capped_square(stretch, model.neighbour_distance)
+            same[i] += w.neighbour_distance_same * robust_square(stretch, 1 / model.neighbour_distance)
             different[i] += w.neighbour_stiffness_different * (1 - stiff)
     return length, same, different
 
@@ -159,10 +153,9 @@ def fill_residual(
     residual: Array,
 ) -> None:
     """`moved` (N, 2) and `residual` (N,) of cluster c at its motion (3,). Other arguments as in `tabulate`."""
-    cos, sin = math.cos(motion[0]), math.sin(motion[0])
+    by = transform_of(motion)
     for i in range(len(source)):
-        x = cos * source[i, 0] - sin * source[i, 1] + motion[1]
-        y = sin * source[i, 0] + cos * source[i, 1] + motion[2]
+        x, y = transform(by, source[i, 0], source[i, 1])
         j = association[i] if association[i] >= 0 else nearest_target[i, c]
         moved[i, 0], moved[i, 1], residual[i] = x, y, distance(x - target[j, 0], y - target[j, 1])
 
@@ -171,13 +164,13 @@ def fill_residual(
 def fill_agreement(
     moved: Array, residual: Array, association: Integers, reach: Booleans, c: int, model: ClusteringModel, log_inlier: Array
 ) -> None:
-    """Potentials (N,) of cluster c but for what beams say, -inf beyond its reach. Other arguments as in `tabulate`."""
+    """Writes the potentials (N,) of cluster c without free-space tests, -inf beyond its reach. See `tabulate` for the arguments."""
     w = model.weights
     for i in range(len(moved)):
         if not reach[i, c]:
             log_inlier[i] = -np.inf
             continue
-        total = w.cluster_distance * capped_square(residual[i], model.cluster_distance)
+        total = w.cluster_distance * robust_square(residual[i], 1 / model.cluster_distance)
         if w.gate != 0:
             total -= w.gate / (1 + math.exp(-(residual[i] / model.gate - 1) / GATE_WIDTH))
         log_inlier[i] = total + (w.cluster_inlier_in if association[i] >= 0 else 0.0)
@@ -185,9 +178,9 @@ def fill_agreement(
 
 @kernel
 def subtract_ahead(sweep: Sweep, moved: Array, model: ClusteringModel, log_inlier: Array, log_outlier: Array) -> None:
-    """Takes off what the target's beams say against (N, 2) moved points, where they may be in the cluster.
+    """Subtracts the free-space penalties of (N, 2) moved points in the target, where they may be in the cluster.
 
-    log_inlier: (N,). log_outlier: (N,), the outliers', which gain by what is said against the background; of movers (0,).
+    log_inlier: (N,). log_outlier: (N,), of the outlier, which gains by the background's penalties; (0,) for movers.
     """
     w = model.weights
     is_background = len(log_outlier) > 0
@@ -205,17 +198,15 @@ def subtract_ahead(sweep: Sweep, moved: Array, model: ClusteringModel, log_inlie
 def subtract_back(
     sweep: Sweep, target: Array, motion: Array, association: Integers, model: ClusteringModel, log_inlier: Array
 ) -> None:
-    """Takes off what the source's beams say against the points' partners. motion: (3,) of the cluster; log_inlier: (N,)."""
+    """Subtracts the free-space penalties of the points' partners in the source. motion: (3,) of the cluster; log_inlier: (N,)."""
     w = model.weights
     if w.seen_through_back == 0 and w.hidden_back == 0:
         return
-    back = inverse(motion)
-    cos, sin = math.cos(back[0]), math.sin(back[0])
+    by = transform_of(inverse(motion))
     for i in range(len(association)):
         j = association[i]
         if j >= 0 and log_inlier[i] > -np.inf:
-            x = cos * target[j, 0] - sin * target[j, 1] + back[1]
-            y = sin * target[j, 0] + cos * target[j, 1] + back[2]
+            x, y = transform(by, target[j, 0], target[j, 1])
             seen_through, hidden = look(sweep, x, y)
             log_inlier[i] -= w.seen_through_back * seen_through + w.hidden_back * hidden
 
@@ -233,7 +224,7 @@ def tabulate(
     nearest_target: Integers,
     model: ClusteringModel,
 ) -> Tables:
-    """Motions and associations plugged in.
+    """All potentials at given motions and associations.
 
     Args:
         source: (N, 2); target: (M, 2), and their sweeps.
@@ -287,7 +278,7 @@ def transition_potentials(tables: Tables, states: Integers, log_unary: Array, mo
                 if s != t and is_possible and log_unary[i + 1, t] > -np.inf:
                     k = states[t]
                     across = distance(tables.moved[k, i + 1, 0] - x, tables.moved[k, i + 1, 1] - y)
-                    parting = capped_square(across - tables.length[i], model.neighbour_distance)
+                    parting = robust_square(across - tables.length[i], 1 / model.neighbour_distance)
                     edge[s, t] += w.neighbour_distance_different * parting
             edge[s, P] = edge[P, s] = w.pairwise_outlier
         edge[P, P] = w.sequence

@@ -19,14 +19,14 @@ ROUNDING = 1e-9  # of the unit of features: a change of distance that is none
 
 
 class Kept(NamedTuple):
-    """Filled in by `update`; answers do not depend on what was there.
+    """Candidates kept from round to round, brought up to date by `update`; answers do not depend on them.
 
     Attributes:
         index: (N, K) candidates, ascending. lead: (N,) by which the next target was further away, -1 at first.
         moved: (C, N, 2) where the points were when their lists were made. active: (C,) motions that there were then.
     """
 
-    index: Integers  # type: ignore[assignment]  # a tuple has a method of that name, which nobody needs
+    index: Integers  # type: ignore[assignment]  # hides a method of tuples
     lead: Array
     moved: Array
     active: Booleans
@@ -81,7 +81,7 @@ def keep_nearest(kept: Kept, i: int, longer: Integers, boxes: Boxes, moved: Arra
 
 @kernel
 def update(kept: Kept, boxes: Boxes, source: Array, moved: Array, motions: Array, active: Booleans) -> None:
-    """Brings the lists up to date; they are then what `candidates.by_motion` says.
+    """Brings the lists up to date; they are then those of `candidates.by_motion`.
 
     Args:
         boxes: of M targets. source: (N, 2). moved: (C, N, 2) source points under every active motion.

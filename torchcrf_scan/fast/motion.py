@@ -1,4 +1,4 @@
-"""ComputeRT of one pair from hard labels; `inference.motion` in loops."""
+"""ComputeRT of one pair from hard labels; `inference.motion` without batches."""
 
 from __future__ import annotations
 
@@ -7,20 +7,22 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchcrf_scan.fast.robust import robust_weight
 from torchcrf_scan.inference.motion import ALONG, PATIENCE
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
-from torchcrf_scan.loops.rigid import compose
+from torchcrf_scan.loops.kabsch import kabsch, mean_point
+from torchcrf_scan.loops.rigid import apply_to_rows, compose, motion_onto
+from torchcrf_scan.search.registration import PAIR_ROWS, gauss_newton_step
 
-ROUNDING = 8 * float(np.finfo(np.float64).eps)
 POINT, LINE, GIVEN = 0, 1, 2  # metrics, in this order:
 METRICS = ("point", "line", "given")
 
 
 class Members(NamedTuple):
-    """Which points speak for one cluster, and where they went.
+    """The points of one cluster and their partners.
 
     Attributes:
-        points: (P, 2) source points. partner: (P, 2) where they went. tangent: (P, 2) direction of the surface there.
+        points: (P, 2) source points. partner: (P, 2) associated target points. tangent: (P, 2) of the surface there.
     """
 
     points: Array
@@ -41,7 +43,7 @@ def places_of(association: Integers, cluster: Integers, c: int) -> Integers:
 
 @kernel
 def members_of(source: Array, target: Array, tangents: Array, association: Integers, places: Integers) -> Members:
-    """What the points at P places say. source: (N, 2); target, tangents: (M, 2); association: (N,); places: (P,)."""
+    """The points at P places with their partners. source: (N, 2); target, tangents: (M, 2); association: (N,); places: (P,)."""
     P = len(places)
     points, partner, tangent = np.empty((P, 2)), np.empty((P, 2)), np.empty((P, 2))
     for p in range(P):
@@ -50,16 +52,6 @@ def members_of(source: Array, target: Array, tangents: Array, association: Integ
         partner[p, 0], partner[p, 1] = target[j, 0], target[j, 1]
         tangent[p, 0], tangent[p, 1] = tangents[j, 0], tangents[j, 1]
     return Members(points, partner, tangent)
-
-
-@kernel
-def mean_point(points: Array) -> tuple[float, float]:
-    """Of (P, 2) points; 0 of none."""
-    x = y = 0.0
-    for i in range(len(points)):
-        x, y = x + points[i, 0], y + points[i, 1]
-    total = max(len(points), 1)
-    return x / total, y / total
 
 
 @kernel
@@ -76,94 +68,25 @@ def largest_spread(points: Array) -> float:
 
 
 @kernel
-def kabsch(points: Array, partner: Array) -> Array:
-    """(3,) the motion that minimises the squared distances of (P, 2) points to their partners, P >= 1 (the paper's Eq. 6)."""
-    P = len(points)
-    px, py = mean_point(points)
-    qx, qy = mean_point(partner)
-    sine = cosine = size = 0.0
-    for i in range(P):
-        ax, ay = points[i, 0] - px, points[i, 1] - py
-        bx, by = partner[i, 0] - qx, partner[i, 1] - qy
-        sine += ax * by - ay * bx
-        cosine += ax * bx + ay * by
-        size += math.hypot(points[i, 0], points[i, 1]) * math.hypot(partner[i, 0], partner[i, 1])
-    is_determined = max(abs(sine), abs(cosine)) > ROUNDING * size
-    motion = np.empty(3)
-    motion[0] = math.atan2(sine, cosine) if is_determined else 0.0
-    cos, sin = math.cos(motion[0]), math.sin(motion[0])
-    motion[1] = qx - (cos * px - sin * py)
-    motion[2] = qy - (sin * px + cos * py)
-    return motion
-
-
-@kernel
-def solve(a: float, b: float, c: float, d: float, e: float, f: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Solves ((a, b, c), (b, d, e), (c, e, f)) v = (x, y, z), positive definite, by elimination."""
-    u, v = b / a, c / a
-    dd, ee, ff = d - u * b, e - u * c, f - v * c
-    yy, zz = y - u * x, z - v * x
-    w = ee / dd
-    third = (zz - w * yy) / (ff - w * ee)
-    second = (yy - ee * third) / dd
-    return (x - b * second - c * third) / a, second, third
-
-
-@kernel
 def line_step(members: Members, start: Array, scale: float) -> Array:
-    """(3,) one robust point-to-line step from `start`; `inference.motion.line_fit` and `gauss_newton_step` of one cluster.
+    """(3,) one robust point-to-line step from a motion (3,); `inference.motion.line_fit` of one cluster.
 
     scale: residual at which a point's weight has fallen to a half.
     """
-    points, partner, tangent = members
-    P = len(points)
-    moved, weights = np.empty((P, 2)), np.empty(P)
-    cos, sin = math.cos(start[0]), math.sin(start[0])
-    total = cx = cy = 0.0
-    for i in range(P):
-        x = cos * points[i, 0] - sin * points[i, 1] + start[1]
-        y = sin * points[i, 0] + cos * points[i, 1] + start[2]
-        w = 1 / (1 + ((x - partner[i, 0]) ** 2 + (y - partner[i, 1]) ** 2) / scale**2)
-        moved[i, 0], moved[i, 1], weights[i] = x, y, w
-        total, cx, cy = total + w, cx + w * x, cy + w * y
-    total = max(total, 1e-9)
-    cx, cy = cx / total, cy / total
-    slack = 1 - ALONG
-    tt = tx = ty = xx = xy = yy = rt = rx = ry = size = 0.0  # the normal equations of a turn and two shifts
-    for i in range(P):
-        w, ux, uy = weights[i], tangent[i, 0], tangent[i, 1]
-        dx, dy = moved[i, 0] - partner[i, 0], moved[i, 1] - partner[i, 1]
-        lx, ly = -(moved[i, 1] - cy), moved[i, 0] - cx  # d moved / d theta, turning about the weighted centre
-        lu, du = lx * ux + ly * uy, slack * (dx * ux + dy * uy)
-        tt += w * (lx * lx + ly * ly - slack * lu * lu)
-        tx += w * (lx - slack * lu * ux)
-        ty += w * (ly - slack * lu * uy)
-        xx += w * (1 - slack * ux * ux)
-        xy -= w * slack * ux * uy
-        yy += w * (1 - slack * uy * uy)
-        rt -= w * (lx * dx + ly * dy - lu * du)
-        rx -= w * (dx - du * ux)
-        ry -= w * (dy - du * uy)
-        size += w * (lx * lx + ly * ly)
-    tt += 1e-4 * size + 1e-6 * total
-    xx, yy = xx + 1e-3 * total, yy + 1e-3 * total
-    theta, sx, sy = solve(tt, tx, ty, xx, xy, yy, rt, rx, ry)
-    theta = min(max(theta, -0.5), 0.5)
-    cos, sin = math.cos(theta), math.sin(theta)
-    step = np.empty(3)
-    step[0], step[1], step[2] = theta, cx - (cos * cx - sin * cy) + sx, cy - (sin * cx + cos * cy) + sy
-    return compose(step, start)
+    partner, tangent, pairs = members.partner, members.tangent, np.empty((PAIR_ROWS, len(members.points)))
+    apply_to_rows(start, members.points, pairs)
+    for i in range(len(partner)):
+        pairs[2, i], pairs[3, i], pairs[4, i], pairs[5, i] = partner[i, 0], partner[i, 1], tangent[i, 0], tangent[i, 1]
+        pairs[6, i] = robust_weight((pairs[0, i] - pairs[2, i]) ** 2 + (pairs[1, i] - pairs[3, i]) ** 2, scale)
+    return compose(gauss_newton_step(pairs, ALONG), start)
 
 
 @kernel
 def shift_at(members: Members, theta: float) -> Array:
-    """(3,) the best motion with a given rotation."""
+    """(3,) the least-squares motion with a given rotation, radians."""
     px, py = mean_point(members.points)
     qx, qy = mean_point(members.partner)
-    cos, sin = math.cos(theta), math.sin(theta)
-    motion = np.empty(3)
-    motion[0], motion[1], motion[2] = theta, qx - (cos * px - sin * py), qy - (sin * px + cos * py)
-    return motion
+    return motion_onto(theta, px, py, qx, qy)
 
 
 @kernel

@@ -1,7 +1,4 @@
-"""The rounds of whole pairs in loops, without gradients: from where they start to the answer.
-
-Every pair is worked on by one thread.
-"""
+"""The rounds of whole pairs, one thread for every pair, without gradients: from the start to the answer."""
 
 from __future__ import annotations
 
@@ -14,7 +11,8 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.fast.decode import Decoded, Learned, Settings, decode_nothing, decode_pair
+from torchcrf_scan.fast.arrays import Decoded, Fitted, Settings
+from torchcrf_scan.fast.decode import decode_nothing, decode_pair
 from torchcrf_scan.features.learned import LearnedInputs
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.loops.jit import Array
@@ -33,24 +31,24 @@ class Extra(NamedTuple):
 
 
 def decode_pairs(
-    pairs: Sequence[Pair], starts: Sequence[PairStart], extras: Sequence[Extra], learned: Learned, settings: Settings
+    pairs: Sequence[Pair], starts: Sequence[PairStart], extras: Sequence[Extra], fitted: Fitted, settings: Settings
 ) -> list[Decoded]:
     """Labels, motions and beliefs of every pair."""
 
     def answer(b: int) -> Decoded:
         pair, start, extra = pairs[b], starts[b], extras[b]
         decode = decode_pair if pair.fewest_points > 0 else decode_nothing
-        return decode(pair, start, *extra, learned, settings)
+        return decode(pair, start, *extra, fitted, settings)
 
     return for_each(answer, range(len(pairs)))
 
 
-def predict(batch: ScanPairBatch, start: Start, learned: Learned, settings: Settings, inputs: LearnedInputs | None) -> Prediction:
+def predict(batch: ScanPairBatch, start: Start, fitted: Fitted, settings: Settings, inputs: LearnedInputs | None) -> Prediction:
     """`JointScanCRF.forward` from a start: labels, motions and beliefs of every pair. inputs: without embeddings."""
     pairs = [pair_of(batch, b) for b in range(len(batch))]
     starts = [start_arrays(start, b, pair) for b, pair in enumerate(pairs)]
     extras = extras_of([len(pair.source) for pair in pairs], inputs)
-    return prediction_of(decode_pairs(pairs, starts, extras, learned, settings), batch)
+    return prediction_of(decode_pairs(pairs, starts, extras, fitted, settings), batch)
 
 
 def extras_of(points: Sequence[int], inputs: LearnedInputs | None) -> list[Extra]:

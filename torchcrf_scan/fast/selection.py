@@ -1,4 +1,4 @@
-"""Which hypothesised movers of one pair there are; `inference.selection` in loops."""
+"""Selection of the hypothesised movers of one pair; `inference.selection` without batches."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from torchcrf_scan.fast.clustering import ClusteringModel, Tables, node_potentials, transition_potentials
-from torchcrf_scan.inference.selection import CAPPED
+from torchcrf_scan.inference.state import CAPPED
 from torchcrf_scan.loops.jit import Array, Booleans, kernel
 from torchcrf_scan.loops.messages import log_partition_without
 
@@ -25,7 +25,7 @@ class Worth(NamedTuple):
 
 
 def worth_of(parameters: Parameters) -> Worth:
-    """The learned numbers out of their tensors."""
+    """The fitted weights as numbers."""
     potential = parameters.potential
     return Worth(float(potential.explains), float(potential.score), float(potential.bias))
 
@@ -51,7 +51,7 @@ def evidence(tables: Tables, active: Booleans, model: ClusteringModel) -> Array:
 
 @kernel
 def discard_vacuous(tables: Tables, active: Booleans, log_odds: Array, model: ClusteringModel, worth: Worth) -> None:
-    """Takes the movers out of `active` (C,), in place, that are worth less than nothing. log_odds: (C,) of the hypotheses."""
+    """Removes from `active` (C,), in place, the movers of negative potential. log_odds: (C,) of the hypotheses."""
     for _ in range(len(active) - 1):
         if not active[1:].any():
             break

@@ -1,4 +1,4 @@
-"""How sure the answer for one pair is; `inference.uncertainty` in loops."""
+"""Covariance of the motions and calibrated confidence of the labels of one pair; `inference.uncertainty`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcrf_scan.fast.motion import POINT, Members, members_of, places_of
+from torchcrf_scan.fast.robust import robust_weight
 from torchcrf_scan.inference.uncertainty import MOST_CERTAIN, NEIGHBOURS, NOTHING, RUN, STEPS, STRETCH, TINY, WITHIN
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.rigid import rotate, transform, transform_of
+from torchcrf_scan.loops.solve import axes_of, inverse_of, product
 from torchcrf_scan.prediction import LEAST_SHARE
 
-SWEEPS = 30  # of Jacobi's method, more than it ever takes
-EXCLUDED = math.exp(2 * MOST_CERTAIN)  # what a state counts in the sum that it is left out of
+EXCLUDED = math.exp(2 * MOST_CERTAIN)  # belief of a state in the sum that excludes it
 
 
 class Fit(NamedTuple):
@@ -29,82 +31,6 @@ class Fit(NamedTuple):
     freedom: Array
     centre: Array
     length: float
-
-
-@kernel
-def inverse_of(matrix: Array) -> Array:
-    """(3, 3) inverse by elimination with pivots."""
-    left, right = matrix.copy(), np.eye(3)
-    for k in range(3):
-        pivot = k
-        for r in range(k + 1, 3):
-            if abs(left[r, k]) > abs(left[pivot, k]):
-                pivot = r
-        for d in range(3):
-            left[k, d], left[pivot, d] = left[pivot, d], left[k, d]
-            right[k, d], right[pivot, d] = right[pivot, d], right[k, d]
-        share = 1 / left[k, k]
-        for d in range(3):
-            left[k, d], right[k, d] = left[k, d] * share, right[k, d] * share
-        for r in range(3):
-            factor = left[r, k]
-            if r != k and factor != 0:
-                for d in range(3):
-                    left[r, d] -= factor * left[k, d]
-                    right[r, d] -= factor * right[k, d]
-    return right
-
-
-@kernel
-def product(a: Array, b: Array) -> Array:
-    """(3, 3) of two such."""
-    found = np.zeros((3, 3))
-    for r in range(3):
-        for d in range(3):
-            found[r, d] = a[r, 0] * b[0, d] + a[r, 1] * b[1, d] + a[r, 2] * b[2, d]
-    return found
-
-
-@kernel
-def turn_away(matrix: Array, vectors: Array, p: int, q: int) -> None:
-    """One of Jacobi's rotations, in place, after which matrix[p, q] is 0. matrix: (3, 3) symmetric; vectors: (3, 3), rows."""
-    if matrix[p, q] == 0:
-        return
-    tilt = (matrix[q, q] - matrix[p, p]) / (2 * matrix[p, q])
-    t = (1.0 if tilt >= 0 else -1.0) / (abs(tilt) + math.sqrt(tilt * tilt + 1))
-    c = 1 / math.sqrt(t * t + 1)
-    s = t * c
-    r = 3 - p - q
-    matrix[p, p] -= t * matrix[p, q]
-    matrix[q, q] += t * matrix[p, q]
-    a, b = matrix[r, p], matrix[r, q]
-    matrix[r, p] = matrix[p, r] = c * a - s * b
-    matrix[r, q] = matrix[q, r] = s * a + c * b
-    matrix[p, q] = matrix[q, p] = 0.0
-    for d in range(3):
-        a, b = vectors[p, d], vectors[q, d]
-        vectors[p, d], vectors[q, d] = c * a - s * b, s * a + c * b
-
-
-@kernel
-def axes_of(symmetric: Array) -> tuple[Array, Array]:
-    """(3,) eigenvalues, ascending, and (3, 3) unit eigenvectors, a row each. symmetric: (3, 3)."""
-    matrix, vectors = symmetric.copy(), np.eye(3)
-    for _ in range(SWEEPS):
-        aside = abs(matrix[0, 1]) + abs(matrix[0, 2]) + abs(matrix[1, 2])
-        if aside <= 1e-18 * (abs(matrix[0, 0]) + abs(matrix[1, 1]) + abs(matrix[2, 2])):
-            break
-        for r in range(3):
-            turn_away(matrix, vectors, r, (r + 1) % 3)
-    values = np.empty(3)
-    for k in range(3):
-        values[k] = matrix[k, k]
-    for k in (0, 1, 0):  # sorts three
-        if values[k] > values[k + 1]:
-            values[k], values[k + 1] = values[k + 1], values[k]
-            for d in range(3):
-                vectors[k, d], vectors[k + 1, d] = vectors[k + 1, d], vectors[k, d]
-    return values, vectors
 
 
 @kernel
@@ -152,15 +78,14 @@ def linearise(
 ) -> Fit:
     """A cluster's fit at its motion. tangent, is_found: of all source points, as `surface_tangents` gives them."""
     P = len(places)
-    cos, sin = math.cos(motion[0]), math.sin(motion[0])
+    by = transform_of(motion)
     weights, residual, arm, centre = np.ones(P), np.empty((P, 2)), np.empty((P, 2)), np.zeros(2)
     total = 0.0
     for p in range(P):
-        x, y = members.points[p, 0], members.points[p, 1]
-        arm[p, 0], arm[p, 1] = cos * x - sin * y + motion[1], sin * x + cos * y + motion[2]
+        arm[p, 0], arm[p, 1] = transform(by, members.points[p, 0], members.points[p, 1])
         residual[p, 0], residual[p, 1] = arm[p, 0] - members.partner[p, 0], arm[p, 1] - members.partner[p, 1]
         if metric != POINT:
-            weights[p] = 1 / (1 + (residual[p, 0] ** 2 + residual[p, 1] ** 2) / scale**2)
+            weights[p] = robust_weight(residual[p, 0] ** 2 + residual[p, 1] ** 2, scale)
         total += weights[p]
         centre[0] += weights[p] * arm[p, 0]
         centre[1] += weights[p] * arm[p, 1]
@@ -177,8 +102,7 @@ def linearise(
         if metric != POINT:
             ux, uy = members.tangent[p, 0], members.tangent[p, 1]
             if is_found[places[p]] and (ux != 0 or uy != 0):
-                tx, ty = tangent[places[p], 0], tangent[places[p], 1]
-                ux, uy = cos * tx - sin * ty, sin * tx + cos * ty
+                ux, uy = rotate(by, tangent[places[p], 0], tangent[places[p], 1])
         lx, ly = -arm[p, 1] / length, arm[p, 0] / length
         along = ux * lx + uy * ly
         jacobian[p, 0, 0], jacobian[p, 1, 0] = lx - ux * along, ly - uy * along
@@ -222,14 +146,27 @@ def shared_scores(score: Array, places: Integers) -> Array:
     return together
 
 
+class Sums(NamedTuple):
+    """Sums over the P points of a fit, with weights w, residuals r and Jacobians J.
+
+    Attributes:
+        score: (P, 3) w J^T r of every point; step: (3,) their sum. normal: (3, 3) w J^T J, apart: (3, 3) w^2 J^T J, both symmetric.
+        total: of the weights. variance: of a residual.
+    """
+
+    score: Array
+    step: Array
+    normal: Array
+    apart: Array
+    total: float
+    variance: float
+
+
 @kernel
-def cluster_covariance(
-    fit: Fit, places: Integers, motion: Array, metric: int, noise: float, reach: float
-) -> tuple[Array, Array, Array]:
-    """(3, 3) covariance, (3,) information and (3, 3) directions of one motion; what they are says `inference.uncertainty`."""
-    P = len(places)
-    score, step = np.empty((P, 3)), np.zeros(3)
-    apart, normal = np.zeros((3, 3)), np.zeros((3, 3))
+def sums_of(fit: Fit, noise: float) -> Sums:
+    """Sums over the points of a fit. noise: standard deviation of a return."""
+    P = len(fit.weights)
+    score, step, apart, normal = np.empty((P, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     total = squares = free = 0.0
     for p in range(P):
         w, j = fit.weights[p], fit.jacobian[p]
@@ -244,45 +181,69 @@ def cluster_covariance(
                 both = w * (j[0, r] * j[0, d] + j[1, r] * j[1, d])
                 normal[r, d] += both
                 apart[r, d] += w * both
-    total = max(total, 1e-9)
-    variance = max(2 * noise**2, squares / max(free, 1e-9))
-    meat = shared_scores(score, places)
+    for r in range(3):
+        for d in range(r):
+            normal[r, d], apart[r, d] = normal[d, r], apart[d, r]
+    return Sums(score, step, normal, apart, max(total, 1e-9), max(2 * noise**2, squares / max(free, 1e-9)))
+
+
+@kernel
+def score_covariance(sums: Sums, places: Integers) -> Array:
+    """(3, 3) covariance of the summed score, the middle of the sandwich estimator. places: (P,) of the points, ascending."""
+    meat = shared_scores(sums.score, places)
     for r in range(3):
         for d in range(3):
-            low, high = min(r, d), max(r, d)
-            meat[r, d] += variance * (apart[low, high] + (NOTHING if r == d else 0.0)) + step[r] * step[d]
-    for r in range(3):
-        for d in range(r, 3):
-            normal[r, d] /= total
-            normal[d, r] = normal[r, d]
-    information, directions = axes_of(normal)
+            meat[r, d] += sums.variance * (sums.apart[r, d] + (NOTHING if r == d else 0.0)) + sums.step[r] * sums.step[d]
+    return meat
+
+
+@kernel
+def projection_on(information: Array, directions: Array) -> Array:
+    """(3, 3) projection on the directions (3, 3), a row each, whose information (3,) is large enough to count."""
     keep = np.zeros((3, 3))
     for k in range(3):
         if information[k] >= LEAST_SHARE:
             for r in range(3):
                 for d in range(3):
                     keep[r, d] += directions[k, r] * directions[k, d]
-    if metric != POINT:  # by what is left of the tangents' noise, and by steps along the surface
+    return keep
+
+
+@kernel
+def cluster_covariance(
+    fit: Fit, places: Integers, motion: Array, metric: int, noise: float, reach: float
+) -> tuple[Array, Array, Array]:
+    """(3, 3) covariance, (3,) information and (3, 3) directions of one motion, as `inference.uncertainty` defines them.
+
+    Args:
+        places: (P,) the cluster's points, ascending. motion: (3,). metric: POINT, else point-to-line.
+        noise: standard deviation of a return. reach: largest distance of a source point from the sensor.
+    """
+    sums = sums_of(fit, noise)
+    normal, total = sums.normal, sums.total
+    for r in range(3):
+        for d in range(3):
+            normal[r, d] /= total
+    information, directions = axes_of(normal)
+    if metric != POINT:  # information that the tangents' noise and the steps along the surface only pretend
         for r in range(3):
             normal[r, r] -= LEAST_SHARE
+    keep = projection_on(information, directions)
     bread = product(product(keep, normal), keep)
-    known = product(product(bread, inverse_of(meat)), bread)
+    known = product(product(bread, inverse_of(score_covariance(sums, places))), bread)
     for r in range(3):
         for d in range(3):
             known[r, d] *= total * total
     known[0, 0] += 3 / (math.pi * fit.length) ** 2
     known[1, 1] += 1 / reach**2
     known[2, 2] += 1 / reach**2
-    return (
-        about_origin(inverse_of(known), fit.length, motion[1] - fit.centre[0], motion[2] - fit.centre[1]),
-        information,
-        directions,
-    )
+    x, y = motion[1] - fit.centre[0], motion[2] - fit.centre[1]
+    return about_origin(inverse_of(known), fit.length, x, y), information, directions
 
 
 @kernel
 def about_origin(local: Array, length: float, x: float, y: float) -> Array:
-    """(3, 3) covariance of (theta, tx, ty) from that of (theta L, x, y) about a centroid that (x, y) leads to t from."""
+    """(3, 3) covariance of (theta, tx, ty) from that of (theta L, x, y) about a centroid; (x, y): from there to the translation."""
     change = np.zeros((3, 3))
     change[0, 0], change[1, 0], change[2, 0] = 1 / length, -y / length, x / length
     change[1, 1] = change[2, 2] = 1.0
@@ -334,7 +295,7 @@ def motion_covariance(
 
 @kernel
 def confidence(yes: float, no: float, calibration: Array) -> float:
-    """Calibrated probability of what has belief `yes` against `no`. calibration: (2,) slope and offset."""
+    """Calibrated probability of a statement with beliefs `yes` and `no`. calibration: (2,) slope and offset."""
     return 1 / (1 + math.exp(-(calibration[0] * (math.log(yes) - math.log(no)) + calibration[1])))
 
 

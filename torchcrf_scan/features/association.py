@@ -12,6 +12,7 @@ from torch import Tensor
 from torchcrf_scan.features.scales import Scales, robust_square
 from torchcrf_scan.features.shape import ShapeDescriptors, gather_points
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.names import ANGLES, DISTANCES, GEODESICS, LOCAL_CHANNELS, SHAPE_CHANNELS, STATIC_CHANNELS
 
 
 def _of_candidates(values: Tensor, candidates: Tensor) -> Tensor:
@@ -37,11 +38,12 @@ def shape_features(source: ShapeDescriptors, target: ShapeDescriptors, candidate
         return robust_square(error, scale[:, None]).mean(-1)
 
     angle = se2.wrap(source.angle[:, :, None] - _of_candidates(target.angle, candidates))
+    distance, turn, geodesic = scales.local[:SHAPE_CHANNELS].split([len(DISTANCES), len(ANGLES), len(GEODESICS)])
     return torch.cat(
         [
-            lengths(source.distance, target.distance, scales.local[0:3]),
-            robust_square(angle, scales.local[3:6]),
-            lengths(source.geodesic, target.geodesic, scales.local[6:9]),
+            lengths(source.distance, target.distance, distance),
+            robust_square(angle, turn),
+            lengths(source.geodesic, target.geodesic, geodesic),
         ],
         dim=-1,
     )
@@ -55,7 +57,8 @@ def position_features(
     radius = torch.linalg.vector_norm(source_points, dim=-1)[:, :, None] - torch.linalg.vector_norm(q, dim=-1)
     moved = se2.apply(initial_motion, source_points)
     translation = torch.linalg.vector_norm(moved[:, :, None] - q, dim=-1)
-    return torch.stack([robust_square(radius, scales.local[9]), robust_square(translation, scales.local[10])], dim=-1)
+    errors = {"radius": radius, "translation": translation}
+    return torch.stack([robust_square(errors[name], scales.local[LOCAL_CHANNELS.index(name)]) for name in errors], dim=-1)
 
 
 def registered_distance(moved: Tensor, target_points: Tensor, candidates: Tensor) -> Tensor:
@@ -65,7 +68,7 @@ def registered_distance(moved: Tensor, target_points: Tensor, candidates: Tensor
 
 def registered_feature(moved: Tensor, target_points: Tensor, candidates: Tensor, scales: Scales) -> Tensor:
     """L12: distance after the point's own motion. moved: (B, N, 2) source points under it. Returns (B, N, K)."""
-    return robust_square(registered_distance(moved, target_points, candidates), scales.local[11])
+    return robust_square(registered_distance(moved, target_points, candidates), scales.local[STATIC_CHANNELS])
 
 
 def outlier_inputs(local: Tensor, data_margin: Tensor, candidates: Tensor, candidate_mask: Tensor) -> Tensor:

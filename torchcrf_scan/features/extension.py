@@ -13,8 +13,12 @@ from torch.nn.functional import pad
 
 from torchcrf_scan.features.free_space import FreeSpace
 from torchcrf_scan.features.scales import Scales, beyond_gate
+from torchcrf_scan.names import CLUSTERING_DECISIONS, CLUSTERING_FREE_SPACE
 
 FARTHEST_EXCESS = 3.0  # scales
+_OF_OUTLIER = [name for name in (*CLUSTERING_DECISIONS, *CLUSTERING_FREE_SPACE) if name.startswith("outlier")]
+_OF_INLIERS = [name for name in (*CLUSTERING_DECISIONS, *CLUSTERING_FREE_SPACE) if name not in _OF_OUTLIER]
+ORDER = [[*_OF_INLIERS, *_OF_OUTLIER].index(name) for name in (*CLUSTERING_DECISIONS, *CLUSTERING_FREE_SPACE)]
 
 
 def association_extension(distance: Tensor, mask: Tensor, sight: FreeSpace, scales: Scales) -> Tensor:
@@ -51,7 +55,7 @@ def clustering_extension(residual: Tensor, ahead: FreeSpace, back: FreeSpace, is
     inliers = -torch.stack([beyond_gate(residual, scales), *contradicted], dim=-1)
     under_background = [ahead.seen_through[..., 0], ahead.hidden[..., 0]]
     outlier = torch.stack([torch.ones_like(under_background[0]), *under_background], dim=-1)
-    return with_outlier(inliers, outlier)[..., [0, 5, 1, 2, 3, 4, 6, 7]]
+    return with_outlier(inliers, outlier)[..., ORDER]
 
 
 def with_outlier(inliers: Tensor, outlier: Tensor) -> Tensor:

@@ -15,16 +15,10 @@ from torchcrf_scan.features.candidates import Candidates
 from torchcrf_scan.features.extension import association_extension, clustering_extension
 from torchcrf_scan.features.free_space import Sweep, look
 from torchcrf_scan.features.learned import LearnedInputs, add_log
-from torchcrf_scan.features.scales import (
-    ASSOCIATION_UNARY,
-    CLUSTERING_UNARY,
-    LOCAL_CHANNELS,
-    STATIC_CHANNELS,
-    Scales,
-    robust_square,
-)
+from torchcrf_scan.features.scales import Scales, robust_square
 from torchcrf_scan.features.shape import ShapeDescriptors, describe, local_spacing
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.names import ASSOCIATION_UNARY, CLUSTERING_UNARY, LOCAL_CHANNELS, STATIC_CHANNELS
 
 LARGEST_BLOCK = 500_000  # pairs of points that are compared in shape at once
 OUTLIER_INPUTS = len(LOCAL_CHANNELS) + 2

@@ -2,56 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor, nn
 
-if TYPE_CHECKING:
-    from torchcrf_scan.config import FeatureConfig
+from torchcrf_scan.config import FeatureConfig
+from torchcrf_scan.names import (
+    ASSOCIATION_WEIGHTS,
+    CLUSTERING_WEIGHTS,
+    DECISION_WEIGHTS,
+    FREE_SPACE_WEIGHTS,
+    LOCAL_CHANNELS,
+    SCALED_EDGES,
+)
 
 GATE_WIDTH = 0.05
 KAPPA = 9.0  # an error of three standard deviations is as bad as any (spec 0.1)
 
-LOCAL_CHANNELS = (
-    *("dist1", "dist3", "dist5", "angle1", "angle3", "angle5", "geo1", "geo3", "geo5"),
-    *("radius", "translation", "registered_translation"),
-)  # L1..L12
-SHAPE_CHANNELS = 9  # the first nine do not change when either scan moves
-STATIC_CHANNELS = 11  # the last one depends on the motions
-ASSOCIATION_DECISIONS = ("excess", "gate", "outlier_bias")  # extensions: the nearest point or another, and how far is too far
-CLUSTERING_DECISIONS = ("gate", "outlier_bias")
-ASSOCIATION_FREE_SPACE = ("outlier_seen_through", "outlier_hidden")
-CLUSTERING_FREE_SPACE = ("seen_through", "seen_through_back", "hidden", "hidden_back", "outlier_seen_through", "outlier_hidden")
-ASSOCIATION_WEIGHTS = (
-    *LOCAL_CHANNELS,
-    *("data_boosting", "outlier_boosting"),
-    *ASSOCIATION_DECISIONS,
-    *ASSOCIATION_FREE_SPACE,
-    *("sequence", "pairwise_outlier", "pairwise_distance", "pairwise_translation"),
-)  # a01..a14, the extensions, a15..a18
-CLUSTERING_WEIGHTS = (
-    *("cluster_distance", "outlier", "cluster_inlier_in", "cluster_inlier_out"),
-    *CLUSTERING_DECISIONS,
-    *CLUSTERING_FREE_SPACE,
-    *(
-        "sequence",
-        "neighbour_weight_same",
-        "neighbour_weight_different",
-        "neighbour_stiffness_same",
-        "neighbour_stiffness_different",
-    ),
-    *("neighbour_distance_same", "neighbour_distance_different", "pairwise_outlier"),
-)  # c01..c04, the extensions, c05..c12
-ASSOCIATION_UNARY, CLUSTERING_UNARY = len(ASSOCIATION_WEIGHTS) - 4, len(CLUSTERING_WEIGHTS) - 8  # a node's; the rest are an edge's
-FREE_SPACE_WEIGHTS = (
-    *(f"association.{name}" for name in ASSOCIATION_FREE_SPACE),
-    *(f"clustering.{name}" for name in CLUSTERING_FREE_SPACE),
-)
-DECISION_WEIGHTS = (
-    *(f"association.{name}" for name in ASSOCIATION_DECISIONS),
-    *(f"clustering.{name}" for name in CLUSTERING_DECISIONS),
-)
+
+# Scales before any fitting, metres or radians.
+LOCAL = {
+    **{"dist1": 0.1, "dist3": 0.2, "dist5": 0.3, "angle1": 0.3, "angle3": 0.3, "angle5": 0.3},
+    **{"geo1": 0.1, "geo3": 0.3, "geo5": 0.5, "radius": 0.5, "translation": 0.5, "registered_translation": 0.1},
+}
+EDGES = {"pairwise_distance": 0.1, "pairwise_translation": 0.15}
+WORST = -4.0  # what a channel gives the outlier
 
 
 def live_weights(config: FeatureConfig) -> tuple[Tensor, Tensor]:
@@ -107,12 +81,11 @@ class Scales(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        local = [0.1, 0.2, 0.3, 0.3, 0.3, 0.3, 0.1, 0.3, 0.5, 0.5, 0.5, 0.1]
         values = {
-            "local": local,
-            "local_outlier": [-4.0] * 12,
-            "pairwise": [0.1, 0.15],
-            "pairwise_outlier": [-4.0, -4.0],
+            "local": [LOCAL[name] for name in LOCAL_CHANNELS],
+            "local_outlier": [WORST] * len(LOCAL_CHANNELS),
+            "pairwise": [EDGES[name] for name in SCALED_EDGES],
+            "pairwise_outlier": [WORST] * len(SCALED_EDGES),
             "cluster_distance": 0.1,
             "outlier_threshold": 0.3,
             "gate": 0.3,

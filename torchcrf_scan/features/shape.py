@@ -9,9 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.geometry.kabsch import safe_atan2
-
-ORDERS = (1, 3, 5)  # "first, third or fifth neighbour"
-MIN_ARM = 1e-6  # metres; the angle between shorter arms is undefined and called straight
+from torchcrf_scan.loops.shape import MIN_ARM, ORDERS
 
 
 @dataclass(frozen=True, slots=True)

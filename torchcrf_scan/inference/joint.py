@@ -8,10 +8,12 @@ A pair that has settled is frozen, so that it does not matter which other pairs 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from torchcrf_scan.choices import MOTION_METRICS
 from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.association import pairwise_features
@@ -42,22 +44,54 @@ SELECTION_ROUNDS = 2  # that begin with the question which movers there are
 ROBUST_SHARE = 0.3  # of a point's usual residual: across a surface errors are smaller than from point to point
 
 
-def decode(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> Prediction:
+class Update(Protocol):
+    """What a round does with both chains: the coupling of the model."""
+
+    def __call__(
+        self, view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, model: ModelConfig
+    ) -> State:
+        """New labels, beliefs and motions. found: the candidates at the state's motions."""
+
+
+def update_in_turns(
+    view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, model: ModelConfig
+) -> State:
+    """Clustering chain, motions, association chain, motions: each chain takes the other's labels as given.
+
+    A chain that the model does not have is left out.
+    """
+    config = model.inference
+    if model.has_clusters:
+        state = update_clusters(view, start, state, found, parameters, config)
+        state = update_motions(view, start, state, parameters, config)
+    if model.has_association:
+        state = hold_motions(state, config)
+        state = update_association(view, state, found, parameters, config)
+        state = state if model.has_clusters else inliers_are_background(state)
+        state = update_motions(view, start, state, parameters, config, trimmed=not model.has_clusters)
+    return state
+
+
+def decode(
+    view: PairView, start: Start, parameters: Parameters, model: ModelConfig, update: Update = update_in_turns
+) -> Prediction:
     """Labels and motions of a batch by the sweep schedule; differentiable through beliefs and, where soft, through motions."""
-    last = settle(view, start, parameters, model)
+    last = settle(view, start, parameters, model, update)
     return read_out(view, start, last.state, parameters, model.inference, last.converged, last.iterations)
 
 
-def settle(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> Round:
-    """What B pairs have come to after the last round, clusters that turned out to be one merged."""
-    last = rounds(view, start, parameters, model)[-1]
+def settle(view: PairView, start: Start, parameters: Parameters, model: ModelConfig, update: Update = update_in_turns) -> Round:
+    """State of B pairs after the last round, clusters that turned out to be one merged."""
+    last = rounds(view, start, parameters, model, update)[-1]
     return replace(last, state=merge_alike(view, last.state, parameters.scales.cluster_distance))
 
 
-def rounds(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> list[Round]:
+def rounds(
+    view: PairView, start: Start, parameters: Parameters, model: ModelConfig, update: Update = update_in_turns
+) -> list[Round]:
     """The start and every round after it. With `stop_early` off there are `iterations` of them, and no step depends on a value."""
     batch, config = view.batch, model.inference
-    is_chosen = config.movers == "threshold" or start.log_odds is None or model.chains == "matching"
+    is_chosen = config.movers == "threshold" or start.log_odds is None or not model.has_clusters
     start = start if is_chosen else start.considered()
     state = first_state(view, start, parameters, config)
     before = state
@@ -67,7 +101,7 @@ def rounds(view: PairView, start: Start, parameters: Parameters, model: ModelCon
     for done in range(config.iterations):
         if done < SELECTION_ROUNDS and not is_chosen:
             state = discard_vacuous(view, start, state, parameters, config)
-        after = step(view, start, state, parameters, config, model.chains, model.coupling)
+        after = step(view, start, state, parameters, model, update)
         if config.stop_early:
             after = damp(after, state, before)
             after = keep_settled(after, state, converged)
@@ -111,31 +145,12 @@ def step(
     start: Start,
     state: State,
     parameters: Parameters,
-    config: InferenceConfig,
-    chains: str = "joint",
-    coupling: str = "motions",
+    model: ModelConfig,
+    update: Update = update_in_turns,
 ) -> State:
-    """One round: clustering chain, motions, association chain, motions. A chain that is not in `chains` is left out.
-
-    With `coupling` lattice: both chains as one, motions.
-    """
-    found = find_candidates(view, state.motions.value, state.motions.active, config)
-    state = hold_motions(state, config)
-    if coupling == "lattice":
-        from torchcrf_scan.variants.lattice import update_lattice
-
-        state = update_lattice(view, start, state, found, parameters, config)
-        state = update_motions(view, start, state, parameters, config)
-        return replace(state, motions=retire_empty(state.motions, count_points(state)))
-    if chains != "matching":
-        state = update_clusters(view, start, state, found, parameters, config)
-        state = update_motions(view, start, state, parameters, config)
-    if chains != "clustering":
-        state = hold_motions(state, config)
-        state = update_association(view, state, found, parameters, config)
-        if chains == "matching":
-            state = inliers_are_background(state)
-        state = update_motions(view, start, state, parameters, config, trimmed=chains == "matching")
+    """One round: candidates at the present motions, both chains, clusters that have no points any more."""
+    found = find_candidates(view, state.motions.value, state.motions.active, model.inference)
+    state = update(view, start, hold_motions(state, model.inference), found, parameters, model)
     return replace(state, motions=retire_empty(state.motions, count_points(state)))
 
 
@@ -214,14 +229,15 @@ def update_motions(
     view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig, *, trimmed: bool = False
 ) -> State:
     """ComputeRT. trimmed: Kabsch leaves out the worst fifth, for a cluster that holds movers as well (spec 9.2)."""
-    if config.motion_metric == "given":
+    metric = MOTION_METRICS[config.motion_metric]
+    if not metric.is_fitted:
         return state
     batch = view.batch
     geometry = (batch.source, batch.target, start.target_tangents)
     support = hard_support(*geometry, state.association, state.cluster, state.motions.value.shape[1])
     if config.motion_weights == "soft":
         support = soft_support(*geometry, support, state.candidates, state.log_association, state.log_cluster)
-    if trimmed and config.motion_metric == "point":
+    if trimmed and not metric.along_surface:
         support = trim(batch.source, support)
     scale = ROBUST_SHARE * parameters.scales.cluster_distance
     motions = estimate(batch.source, support, state.motions, metric=config.motion_metric, scale=scale, min_extent=config.min_extent)

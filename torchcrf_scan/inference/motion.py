@@ -112,15 +112,12 @@ def estimate(source: Tensor, support: Support, previous: Motions, *, metric: str
     motion stays, for two rounds (`retire_empty`). The background with fewer than three points keeps its motion.
 
     Args:
-        source: (B, N, 2). metric: `point` (closed-form Kabsch) or `line` (a robust Gauss-Newton step to the target's surface).
+        source: (B, N, 2). metric: one of `FITS`.
         scale: () residual at which a robust weight has fallen to a half, metres. min_extent: metres.
     """
     points = source[:, None].expand(-1, support.weights.shape[1], -1, -1)  # (B, C, N, 2)
     partner = support.partner[:, None].expand_as(points)
-    if metric == "point":
-        fitted = kabsch(points, partner, support.weights)
-    else:
-        fitted = line_fit(points, partner, support, previous.value, scale)
+    fitted = FITS[metric](points, partner, support, previous.value, scale)
     total = support.weights.sum(-1, keepdim=True)  # (B, C, 1)
     share = support.weights / total.clamp(min=1e-9)
     large = (support.count >= 3) & (support.spread >= min_extent)
@@ -158,6 +155,11 @@ def retire_empty(motions: Motions, count: Tensor) -> Motions:
     return Motions(motions.value, active, empty_for)
 
 
+def point_fit(points: Tensor, partner: Tensor, support: Support, start: Tensor, scale: Tensor) -> Tensor:
+    """Closed-form Kabsch (Eq. 6), from any start. Arguments as in `line_fit`."""
+    return kabsch(points, partner, support.weights)
+
+
 def line_fit(points: Tensor, partner: Tensor, support: Support, start: Tensor, scale: Tensor) -> Tensor:
     """One robust point-to-line step from `start`. points, partner: (B, C, N, 2); start: (B, C, 3). Returns (B, C, 3)."""
     moved = se2.apply(start, points)
@@ -165,6 +167,9 @@ def line_fit(points: Tensor, partner: Tensor, support: Support, start: Tensor, s
     distance = moved - partner
     robust = support.weights / (1 + (distance**2).sum(-1) / scale**2)
     return se2.compose(gauss_newton_step(moved, partner, tangent, robust, ALONG), start)
+
+
+FITS = {"point": point_fit, "line": line_fit}  # by the name of the metric, `choices.MOTION_METRICS`
 
 
 @dataclass(slots=True)

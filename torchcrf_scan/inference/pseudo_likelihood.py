@@ -207,10 +207,10 @@ def beside_true_neighbours(pairwise: Tensor, label: Tensor, known: Tensor) -> tu
 def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Parameters, config: ModelConfig) -> Tensor:
     """(B,) sum over nodes and chains (one chain alone where the model has one)."""
     total = view.batch.source.new_zeros(len(view.batch))
-    if config.chains != "clustering":
+    if config.has_association:
         design = association_design(view, plugins, parameters.scales, parameters.boosters, config.inference)
         total = total + design.log_likelihood(parameters.association).sum(-1)
-    if config.chains != "matching":
+    if config.has_clusters:
         total = total + clustering_design(view, plugins, parameters.scales).log_likelihood(parameters.clustering).sum(-1)
     return total
 

@@ -11,51 +11,17 @@ The least worth of a pair goes first, for two that explain the same points are e
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.learned import clustering_extra
 from torchcrf_scan.features.potentials import PairView, clustering_potentials, contradictions, find_candidates, possible_clusters
 from torchcrf_scan.inference.messages import log_partition, silence_padding
-
-if TYPE_CHECKING:
-    from torchcrf_scan.inference.start import Start
-    from torchcrf_scan.inference.state import Parameters, State
-
-CAPPED = 5.0  # log-odds; a hypothesis is never surer than this
-
-
-class ClusterPotential(nn.Module):
-    """The log-linear worth of a mover's cluster; its three named weights are fitted with the rest (`learning.selection_fit`).
-
-    Attributes:
-        explains: () of log(1 + what the cluster adds to the clustering chain's log Z).
-        score: () of the hypothesis' log-odds. bias: ().
-    """
-
-    explains: Tensor
-    score: Tensor
-    bias: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("explains", torch.tensor(1.0))
-        self.register_buffer("score", torch.tensor(1.0))
-        self.register_buffer("bias", torch.tensor(-2.0))
-
-    def forward(self, evidence: Tensor, log_odds: Tensor) -> Tensor:
-        """(...) worth; a cluster below 0 is dropped. evidence, log_odds: (...)."""
-        explained, scored = self.terms(evidence, log_odds).unbind(-1)
-        return self.bias + self.explains * explained + self.score * scored
-
-    @staticmethod
-    def terms(evidence: Tensor, log_odds: Tensor) -> Tensor:
-        """(..., 2) what the weights belong to."""
-        return torch.stack([evidence.clamp(min=0).log1p(), log_odds.clamp(-CAPPED, CAPPED)], dim=-1)
+from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.state import Parameters, State
 
 
 @torch.no_grad()

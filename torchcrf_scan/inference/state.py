@@ -1,16 +1,47 @@
-"""."""
+"""What the rounds take and pass on: everything that was learned, and the labels, beliefs and motions after each round."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from torchcrf_scan.features.potentials import Boosters
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.motion import Motions
-from torchcrf_scan.inference.selection import ClusterPotential
 from torchcrf_scan.inference.uncertainty import Calibration
+
+CAPPED = 5.0  # log-odds; a hypothesis is never surer than this
+
+
+class ClusterPotential(nn.Module):
+    """The log-linear worth of a mover's cluster; its three named weights are fitted with the rest (`learning.selection_fit`).
+
+    Attributes:
+        explains: () of log(1 + what the cluster adds to the clustering chain's log Z).
+        score: () of the hypothesis' log-odds. bias: ().
+    """
+
+    explains: Tensor
+    score: Tensor
+    bias: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("explains", torch.tensor(1.0))
+        self.register_buffer("score", torch.tensor(1.0))
+        self.register_buffer("bias", torch.tensor(-2.0))
+
+    def forward(self, evidence: Tensor, log_odds: Tensor) -> Tensor:
+        """(...) worth; a cluster below 0 is dropped. evidence, log_odds: (...)."""
+        explained, scored = self.terms(evidence, log_odds).unbind(-1)
+        return self.bias + self.explains * explained + self.score * scored
+
+    @staticmethod
+    def terms(evidence: Tensor, log_odds: Tensor) -> Tensor:
+        """(..., 2) what the weights belong to."""
+        return torch.stack([evidence.clamp(min=0).log1p(), log_odds.clamp(-CAPPED, CAPPED)], dim=-1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
+from torchcrf_scan.choices import MOTION_METRICS
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import safe_atan2
 from torchcrf_scan.inference.motion import Support
@@ -66,7 +67,9 @@ def motion_covariance(
     information, vectors = torch.linalg.eigh(normal.detach())
     seen = vectors * (information >= LEAST_SHARE)[..., None, :]
     keep = seen @ vectors.mT  # projection onto what is observed
-    pretended = 0.0 if metric == "point" else LEAST_SHARE  # by what is left of the tangents' noise, and by steps along the surface
+    pretended = (
+        LEAST_SHARE if MOTION_METRICS[metric].along_surface else 0.0
+    )  # by what is left of the tangents' noise, and by steps along the surface
     bread = keep @ (normal - pretended * identity) @ keep * total[..., None, None]
     length = at.length.double()
     prior = torch.stack([3 / (torch.pi * length) ** 2, *(1 / reach[:, None] ** 2).expand(2, *length.shape)], -1).diag_embed()
@@ -100,7 +103,7 @@ class Linearisation:
         moved = se2.apply(motions, source[:, None])  # (B, C, N, 2)
         residual = moved - support.partner[:, None]
         weights, along = support.weights, torch.zeros_like(moved)
-        if metric != "point":
+        if MOTION_METRICS[metric].along_surface:
             squared_scale = (scale**2).expand(source.shape[0])[:, None, None]
             weights = weights / (1 + (residual**2).sum(-1) / squared_scale)
             along = moved_tangents(source, support, motions, noise)

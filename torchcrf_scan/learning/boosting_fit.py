@@ -13,9 +13,10 @@ from torchcrf_scan.features import association
 from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.features.candidates import squared_distances
 from torchcrf_scan.features.potentials import OUTLIER_INPUTS, AssociationStates, Boosters, PairView, find_candidates
-from torchcrf_scan.features.scales import LOCAL_CHANNELS, STATIC_CHANNELS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.pseudo_likelihood import PlugIns
 from torchcrf_scan.learning.scales_fit import own_motion
+from torchcrf_scan.names import LOCAL_CHANNELS, STATIC_CHANNELS
 
 NEAREST = 15
 

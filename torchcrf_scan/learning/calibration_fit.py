@@ -66,7 +66,7 @@ def calibrate(model: JointScanCRF, material: Sequence[Material]) -> None:
     the default.
     """
     model.calibration.load_state_dict(Calibration().state_dict())
-    if model.config.chains != "joint":
+    if not (model.config.has_association and model.config.has_clusters):
         return
     pairs = [pair for part in material for pair in part.pairs]
     dominated = {id(pair) for pair in pairs if moving_share(pair) > DOMINATED}

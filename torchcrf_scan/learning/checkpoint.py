@@ -1,10 +1,9 @@
-"""Checkpoints that survive: written beside their place, flushed to the disk, moved there; whole or not at all."""
+"""Checkpoints that survive a killed process and a full disk."""
 
 from __future__ import annotations
 
 import io
 import logging
-import os
 import pickle
 import random
 from dataclasses import dataclass
@@ -15,34 +14,12 @@ import numpy as np
 import torch
 
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
 NAME = "checkpoint.pt"
 FORMAT = 1  # of what is written
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Replaces a file by new content in one step that a killed process or a full disk cannot leave half done.
-
-    Raises:
-        OSError: it could not be written; the file that was there still is.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # the new name too, not the content alone
-    finally:
-        os.close(folder)
 
 
 @dataclass(slots=True)
@@ -68,7 +45,7 @@ class Store:
         content = io.BytesIO()
         torch.save({"format": FORMAT, "settings": self.settings, "random": random_state(), **state}, content)
         try:
-            write_bytes(self.path, content.getvalue())
+            write_whole(self.path, content.getvalue())
         except OSError as error:
             kept = "there is none before it" if self.last is None else f"that of step {self.last} is kept"
             log.warning("checkpoint of step %d not written, %s: %s", step, kept, error)

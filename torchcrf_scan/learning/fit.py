@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcrf_scan.features.potentials import Boosters, PairView
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS, live_weights
+from torchcrf_scan.features.scales import live_weights
 from torchcrf_scan.inference import joint, pseudo_likelihood
 from torchcrf_scan.inference.pseudo_likelihood import Chain, PlugIns
 from torchcrf_scan.inference.start import Start
@@ -25,7 +25,8 @@ from torchcrf_scan.learning.selection_fit import fit_potential
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.learning.weights_fit import Watch, fit_chain
 from torchcrf_scan.model import JointScanCRF
-from torchcrf_scan.variants.lattice_likelihood import lattice_chain
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS
+from torchcrf_scan.variants.register import ONE_CHAINS, OneChain
 
 Margins = dict[int, Boosters]  # by out-of-fold part, boosters that have not seen it
 
@@ -51,7 +52,7 @@ def fit(
     """Fits scales, boosters and weights of `model`, in place.
 
     Args:
-        watch: callbacks of the weight fits, by chain: `association`, `clustering`; or of the one fit, `lattice`.
+        watch: callbacks of the weight fits, by chain: `association`, `clustering`; or of the one fit, by coupling: `lattice`.
         features_of: a model with both chains that was fitted on the same material, and what its fit returned: scales and boosters
             are then taken from there.
 
@@ -60,22 +61,22 @@ def fit(
     """
     watch = watch or {}
     generator = torch.Generator().manual_seed(config.seed)
-    chains = model.config.chains
+    has_association, has_clusters = model.config.has_association, model.config.has_clusters
     lessons = [prepare(model, part, config, generator) for part in material]
     margins = fit_features(model, lessons, config, generator, features_of)
-    if model.config.coupling == "lattice":
-        fit_lattice(model, lessons, margins, config, watch.get("lattice"))
+    if one_chain := ONE_CHAINS.get(model.config.coupling):
+        fit_one_chain(model, one_chain, lessons, margins, config, watch.get(model.config.coupling))
         return margins
     live = live_weights(model.config.features)
     predicted = [lesson.start.association for lesson in lessons]
-    if chains != "clustering":
+    if has_association:
         features = (association_chain(model, lesson, margins[lesson.fold]) for lesson in lessons)
         set_weights(model, "association", fit_chain(features, live[0], config, watch.get("association")))
         predicted = [predict_association(model, lesson, margins[lesson.fold]) for lesson in lessons]
-    if chains != "matching":
+    if has_clusters:
         features = (clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True))
         set_weights(model, "clustering", fit_chain(features, live[1], config, watch.get("clustering")))
-    if chains == "joint":
+    if has_association and has_clusters:
         model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
     return margins
 
@@ -95,15 +96,20 @@ def fit_features(
         return margins
     fitted = fit_scales([lesson.view for lesson in lessons], [lesson.plugins for lesson in lessons])
     model.scales.load_state_dict(fitted.state_dict())
-    return {} if model.config.chains == "clustering" else fit_all_boosters(model, lessons, config, generator)
+    return fit_all_boosters(model, lessons, config, generator) if model.config.has_association else {}
 
 
-def fit_lattice(
-    model: JointScanCRF, lessons: Sequence[Lesson], margins: Margins, config: LearningConfig, watch: Watch | None
+def fit_one_chain(
+    model: JointScanCRF,
+    one_chain: OneChain,
+    lessons: Sequence[Lesson],
+    margins: Margins,
+    config: LearningConfig,
+    watch: Watch | None,
 ) -> None:
-    """All 30 weights at once; no association is plugged in, so `config.predicted_share` says nothing."""
+    """All weights at once, of a coupling that decides both labels together; no association is plugged in (`predicted_share`)."""
     inference = model.config.inference
-    features = (lattice_chain(of.view, of.plugins, model.scales, margins[of.fold], inference) for of in lessons)
+    features = (one_chain(of.view, of.plugins, model.scales, margins[of.fold], inference) for of in lessons)
     live = torch.cat(live_weights(model.config.features))
     association, clustering = fit_chain(features, live, config, watch).split([len(ASSOCIATION_WEIGHTS), len(CLUSTERING_WEIGHTS)])
     set_weights(model, "association", association)
@@ -115,7 +121,7 @@ def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generat
     view = model.view(part.batch)
     start = part.start.scaled(view.factor)
     plugins = training_plugins(view.batch, start, config, generator)
-    if model.config.chains == "matching":
+    if not model.config.has_clusters:
         plugins, start = pseudo_likelihood.for_background_alone(plugins), start.background_alone()
     return Lesson(view, start, plugins, part.fold)
 
@@ -162,7 +168,7 @@ def clustering_chain(
     model: JointScanCRF, lesson: Lesson, predicted: Tensor, config: LearningConfig, generator: torch.Generator
 ) -> Chain:
     """The lesson's clustering features, with predicted associations for some pairs; for all where the chain stands alone (A-28)."""
-    share = config.predicted_share if model.config.chains == "joint" else 1.0
+    share = config.predicted_share if model.config.has_association else 1.0
     plugins = mix_associations(lesson.plugins, predicted, share, generator)
     return pseudo_likelihood.clustering_chain(lesson.view, plugins, model.scales)
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.optim import AdamW
 
 from torchcrf_scan.learning.checkpoint import Store, set_random_state
+from torchcrf_scan.learning.losses import LOSSES
 from torchcrf_scan.learning.objectives import Objective, known_nodes, make_objective
 from torchcrf_scan.learning.portions import Collate, Portion, load_portions
 from torchcrf_scan.learning.ranks import Ranks
@@ -181,7 +182,7 @@ def train_by_gradient(
         parts = f"{gradient.batch_size} / {gradient.part}"
         raise ValueError(f"gradient.part: expected {parts} parts to be shared out among {ranks.world} processes, got a remainder")
     objective = make_objective(config)
-    needs_start = config.first_order != "pseudo_likelihood"
+    needs_start = LOSSES[config.first_order].needs_start
     learner = Learner(model, gradient, ranks)
     validation = Validation.of(held_out, gradient.part, ranks)
 

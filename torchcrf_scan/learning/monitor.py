@@ -16,16 +16,19 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.choices import SCHEDULES
 from torchcrf_scan.evaluation.calibration import Sureness
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.evaluation.summary import summarise
-from torchcrf_scan.features.scales import LOCAL_CHANNELS
-from torchcrf_scan.inference import joint, pseudo_likelihood
+from torchcrf_scan.inference import pseudo_likelihood
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.graph import write_graph
+from torchcrf_scan.learning.losses import LOSSES
 from torchcrf_scan.learning.run_log import write_settings
 from torchcrf_scan.learning.settings import Config
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import LOCAL_CHANNELS
+from torchcrf_scan.variants import sweep
 from torchcrf_scan.viz.curves import plot_confidence, plot_precision_recall, plot_reliability
 from torchcrf_scan.viz.plots import plot_associations, plot_clusters
 
@@ -110,8 +113,9 @@ class TrainingMonitor:
     @property
     def temperature(self) -> float:
         """Of the read-out that the loss looks at."""
-        is_unrolled = self.config.first_order == "unrolled"
-        return self.config.unrolled.temperature if is_unrolled else self.config.model.inference.temperature
+        config = self.config
+        is_own = config.has_steps and LOSSES[config.first_order].has_temperature
+        return config.unrolled.temperature if is_own else config.model.inference.temperature
 
     @while_it_can_write
     def validated(self, step: int, model: JointScanCRF, losses: Mapping[str, float], answers: Answers) -> None:
@@ -184,7 +188,7 @@ def named_weights(model: JointScanCRF) -> dict[str, float]:
 @torch.no_grad()
 def boosted_margins(model: JointScanCRF, batch: ScanPairBatch) -> dict[str, Tensor]:
     """(P,) margins by name: of true pairs of points, of wrong ones, and of points that are outliers or not; at the true motions."""
-    if model.config.chains == "clustering":
+    if not model.config.has_association:
         return {}
     view = model.view(batch)
     plugins = pseudo_likelihood.true_plugins(view.batch, model.config.inference.clusters - 1)
@@ -206,10 +210,10 @@ def belief_changes(model: JointScanCRF, batch: ScanPairBatch, start: Start) -> d
 
     Messages on a chain are exact, so what is left to settle is between the rounds.
     """
-    if model.config.inference.schedule != "sweep":
+    if not SCHEDULES[model.config.inference.schedule].takes_couplings:
         return {}
     view = model.view(batch, model.learned_inputs(batch, start))
-    found = joint.rounds(view, start.scaled(view.factor), model.fitted, model.config)
+    found = sweep.rounds(view, start.scaled(view.factor), model.fitted, model.config)
     beliefs = [of.state.log_cluster.exp() for of in found]
     if beliefs[0].shape != beliefs[-1].shape:  # CRF-Matching has other states than its start
         beliefs = beliefs[1:]

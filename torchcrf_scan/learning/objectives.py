@@ -10,15 +10,18 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.choices import load
 from torchcrf_scan.inference import pseudo_likelihood as features
 from torchcrf_scan.inference.start import Start
+from torchcrf_scan.learning.losses import LOSSES
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.portions import Portion
 from torchcrf_scan.learning.settings import Config, LearningConfig
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.search.accept import score_of
 from torchcrf_scan.search.pairs import choose
-from torchcrf_scan.variants.lattice_likelihood import LatticeChain, lattice_chain
+from torchcrf_scan.variants.lattice_likelihood import LatticeChain
+from torchcrf_scan.variants.register import ONE_CHAINS
 
 Objective = Callable[[JointScanCRF, Portion], dict[str, Tensor]]
 
@@ -57,7 +60,6 @@ def labelled_chains(
     The clustering chain beside another is told the model's own associations in `config.predicted_share` of surveyed pairs (A-28).
     """
     batch, fitted, inference = portion.batch, model.fitted, model.config.inference
-    chains = model.config.chains
     learned = fitted.scales, fitted.boosters, inference
     start = start_of(model, portion) if portion.surveys else None
     generator = torch.Generator().manual_seed(portion.seed)
@@ -66,18 +68,19 @@ def labelled_chains(
         plugins = features.true_plugins(view.batch, inference.clusters - 1)
     else:
         plugins = training_plugins(view.batch, start.scaled(view.factor), config, generator)
-    if model.config.coupling == "lattice":
-        yield "lattice", lattice_chain(view, plugins, *learned), torch.cat([fitted.association, fitted.clustering])
+    has_association, has_clusters = model.config.has_association, model.config.has_clusters
+    if one_chain := ONE_CHAINS.get(model.config.coupling):
+        yield model.config.coupling, one_chain(view, plugins, *learned), torch.cat([fitted.association, fitted.clustering])
         return
-    if chains == "matching":
+    if not has_clusters:
         plugins = features.for_background_alone(plugins)
-    if chains != "clustering":
+    if has_association:
         yield "association", features.association_chain(view, plugins, *learned), fitted.association
-    if chains == "joint" and start is not None:
+    if has_association and has_clusters and start is not None:
         with torch.no_grad():
             predicted = model(batch.without_truth(), start).association
         plugins = mix_associations(plugins, predicted, config.predicted_share, generator)
-    if chains != "matching":
+    if has_clusters:
         yield "cluster", features.clustering_chain(view, plugins, fitted.scales), fitted.clustering
 
 
@@ -85,19 +88,20 @@ def start_of(model: JointScanCRF, portion: Portion) -> Start:
     """The motions to begin with, from what was surveyed, or looked for now."""
     if not portion.surveys:
         return model.initialise(portion.batch)
-    clusters = 1 if model.config.chains == "matching" else model.config.inference.clusters - 1
-    return choose(portion.batch, portion.surveys, score_of(model.hypothesis_score), clusters)
+    return choose(portion.batch, portion.surveys, score_of(model.hypothesis_score), model.config.motions)
 
 
 def make_objective(config: Config) -> Objective:
     """The loss that `config.first_order` names."""
-    if config.first_order == "pseudo_likelihood":
-        return pseudo_likelihood
-    if config.first_order == "likelihood":
-        return partial(likelihood, config=config.learning)
-    from torchcrf_scan.learning.unrolled import unrolled_loss
+    objective: Objective = load(LOSSES[config.first_order].function)(config)
+    return objective
 
-    def unrolled(model: JointScanCRF, portion: Portion) -> dict[str, Tensor]:
-        return unrolled_loss(model, portion.batch, config.unrolled, start_of(model, portion))
 
-    return unrolled
+def make_pseudo_likelihood(config: Config) -> Objective:
+    """`pseudo_likelihood`, which has no settings."""
+    return pseudo_likelihood
+
+
+def make_likelihood(config: Config) -> Objective:
+    """`likelihood` with plug-ins as `config.learning` says."""
+    return partial(likelihood, config=config.learning)

@@ -10,10 +10,12 @@ from torch import Tensor
 from torchcrf_scan.features import association
 from torchcrf_scan.features.candidates import squared_distances
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, association_unary
-from torchcrf_scan.features.scales import LOCAL_CHANNELS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.pseudo_likelihood import PlugIns
+from torchcrf_scan.loops.shape import ORDERS
+from torchcrf_scan.names import LOCAL_CHANNELS, SCALED_EDGES
 
 FLOOR = 0.02  # metres and radians
 CLUSTER_FLOOR = 0.05  # metres
@@ -39,8 +41,8 @@ def fit_scales(views: Sequence[PairView], plugins: Sequence[PlugIns]) -> Scales:
     scales = Scales()
     for f, name in enumerate(LOCAL_CHANNELS):
         scales.local[f] = robust_scale(errors[name], FLOOR)
-    scales.pairwise[0] = robust_scale(errors["pairwise_distance"], FLOOR)
-    scales.pairwise[1] = robust_scale(errors["pairwise_translation"], FLOOR)
+    for p, name in enumerate(SCALED_EDGES):
+        scales.pairwise[p] = robust_scale(errors[name], FLOOR)
     scales.cluster_distance.copy_(robust_scale(errors["cluster"], CLUSTER_FLOOR))
     scales.outlier_threshold.copy_((3 * scales.cluster_distance).clamp(min=0.3))
     scales.gate.copy_(fit_gate(errors["cluster"], errors["unmatched"]))
@@ -75,10 +77,10 @@ def true_errors(view: PairView, plugins: PlugIns) -> dict[str, Tensor]:
     source, target = view.source_shape, view.target_shape
     for name, mine, theirs in (("dist", source.distance, target.distance), ("geo", source.geodesic, target.geodesic)):
         difference = mine - of_partner(theirs)  # (B, N, 3, 2)
-        for order, k in enumerate((1, 3, 5)):
+        for order, k in enumerate(ORDERS):
             out[f"{name}{k}"] = difference[:, :, order][inlier].flatten().double()
     turned = se2.wrap(source.angle - of_partner(target.angle))
-    for order, k in enumerate((1, 3, 5)):
+    for order, k in enumerate(ORDERS):
         out[f"angle{k}"] = turned[:, :, order][inlier].double()
     out["radius"] = (source.radius - torch.linalg.vector_norm(partner, dim=-1))[inlier].double()
     initial = se2.apply(batch.initial_motion, batch.source)
@@ -123,7 +125,7 @@ def fit_outlier_constants(views: Sequence[PairView], plugins: Sequence[PlugIns],
         states = AssociationStates.of(view, index, torch.ones_like(index, dtype=torch.bool), scales, boosters)
         unary = association_unary(view, states, own_motion(plug, batch.source), scales, boosters)
         local.append(unary[:, :, 0, : len(LOCAL_CHANNELS)][inlier])
-        pairwise = association.pairwise_features(batch.source, batch.target, index, scales)[:, :, 0, 0, 2:]
+        pairwise = association.pairwise_features(batch.source, batch.target, index, scales)[:, :, 0, 0, -len(SCALED_EDGES) :]
         edges.append(pairwise[inlier[:, 1:] & inlier[:, :-1]])
     scales.local_outlier.copy_(torch.cat(local).quantile(WORST_SHARE, dim=0))
     on_edges = torch.cat(edges)

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchcrf_scan.features.potentials import PairView, find_candidates
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.selection import ClusterPotential, evidence
+from torchcrf_scan.inference.selection import evidence
 from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.state import ClusterPotential
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.model import JointScanCRF
 

@@ -1,14 +1,19 @@
-"""."""
+"""Settings of learning: from which pairs, by which losses, how fast."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
-from torchcrf_scan.checks import choose, within
+from torchcrf_scan.checks import Amount, OneOf, Positive, Seed, Share, Within, check_fields
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.data.worlds import WORLDS
-from torchcrf_scan.experiment.settings import ExperimentConfig
+from torchcrf_scan.learning.losses import LOSSES, NO_STEPS, STAGED
+
+Count = Annotated[int, Within(1, 1_000_000)]
+CountOrNone = Annotated[int, Within(0, 1_000_000)]
+World = Annotated[str, OneOf(*WORLDS)]
 
 
 @dataclass(frozen=True)
@@ -28,28 +33,19 @@ class UnrolledConfig:
         deep_supervision: earlier rounds count too, each by this factor less than the next; 0: the last alone, 1: all alike.
     """
 
-    iterations: int = 4
-    temperature: float = 1.0
-    association: float = 1.0
-    cluster: float = 1.0
-    rotation: float = 0.2
-    translation: float = 0.2
-    rotation_scale: float = 0.02
-    translation_scale: float = 0.1
+    iterations: Annotated[int, Within(1, 1000)] = 4
+    temperature: Positive = 1.0
+    association: Amount = 1.0
+    cluster: Amount = 1.0
+    rotation: Amount = 0.2
+    translation: Amount = 0.2
+    rotation_scale: Positive = 0.02
+    translation_scale: Positive = 0.1
     detach_motion: bool = False
-    deep_supervision: float = 0.0
+    deep_supervision: Share = 0.0
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueError(f"iterations: expected at least 1, got {self.iterations}")
-        for name in ("temperature", "rotation_scale", "translation_scale"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected a finite number above 0, got {getattr(self, name)}")
-        for name in ("association", "cluster", "rotation", "translation"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected a finite weight of 0 or more, got {getattr(self, name)}")
-        if not 0 <= self.deep_supervision <= 1:
-            raise ValueError(f"deep_supervision: expected a factor between 0 and 1, got {self.deep_supervision}")
+        check_fields(self, "unrolled.")
 
 
 @dataclass(frozen=True)
@@ -57,13 +53,9 @@ class LearningConfig:
     """How the model is learned (spec 2, 6).
 
     Attributes:
-        rotation_noise: radians of noise on the true motions.
-        translation_noise: metres of noise on the true motions.
         objective: `pseudo_likelihood` (the paper's), or `likelihood`: the exact likelihood of each chain, without the former's
             over-strong pairwise weights (spec 6.5); or `unrolled`: from the weights of pseudo-likelihood on through the unrolled
             iterations, step by step (`gradient`).
-        disturbance: units of resolution by which training scans are skewed and bumped, as moving sensors do; 0: as they are.
-        start_share: share of the pairs whose features see InitialiseRT's motions instead.
         predicted_share: share of the pairs whose clustering features see predicted associations (A-28). 0, the true ones, for
             pseudo-likelihood: given its neighbours' true clusters a point learns little else, and movers then fade; a half suits
             `likelihood`. CRF-Clustering alone always sees predicted ones.
@@ -74,26 +66,30 @@ class LearningConfig:
         max_steps: L-BFGS steps at most.
         tolerance: gradient per node at which L-BFGS stops.
         batch_size: pairs that are looked at at once.
+        rotation_noise: radians of noise on the true motions.
+        translation_noise: metres of noise on the true motions.
+        disturbance: units of resolution by which training scans are skewed and bumped, as moving sensors do; 0: as they are.
+        start_share: share of the pairs whose features see InitialiseRT's motions instead.
         seed: of everything drawn while learning.
     """
 
-    objective: str = "pseudo_likelihood"
-    rotation_noise: float = 0.005
-    translation_noise: float = 0.02
-    disturbance: float = 0.7
-    start_share: float = 0.5
-    predicted_share: float = 0.0
-    folds: int = 4
-    negatives: int = 4
-    booster_examples: int = 5_000
-    prior: float = 10.0
-    max_steps: int = 200
-    tolerance: float = 1e-4
-    batch_size: int = 16
-    seed: int = 0
+    objective: Annotated[str, OneOf(*LOSSES)] = STAGED
+    predicted_share: Share = 0.0
+    folds: Annotated[int, Within(0, 1000)] = 4
+    negatives: Annotated[int, Within(1, 1000)] = 4
+    booster_examples: Annotated[int, Within(0)] = 5_000
+    prior: Positive = 10.0
+    max_steps: Count = 200
+    tolerance: Amount = 1e-4
+    batch_size: Annotated[int, Within(1, 10_000)] = 16
+    rotation_noise: Amount = 0.005
+    translation_noise: Amount = 0.02
+    disturbance: Amount = 0.7
+    start_share: Share = 0.5
+    seed: Seed = 0
 
     def __post_init__(self) -> None:
-        choose("objective", self.objective, ("pseudo_likelihood", "likelihood", "unrolled"))
+        check_fields(self, "learning.")
 
 
 @dataclass(frozen=True)
@@ -108,16 +104,14 @@ class AugmentConfig:
         frame_translation: how far the target's frame is moved along x and y, at most; in units of the usual range of the target.
     """
 
-    mirror: float = 0.5
-    dropout: float = 0.1
-    noise: float = 1.0
-    frame_rotation: float = 0.05
-    frame_translation: float = 0.02
+    mirror: Share = 0.5
+    dropout: Annotated[float, Within(0, 0.9)] = 0.1
+    noise: Amount = 1.0
+    frame_rotation: Annotated[float, Within(0, math.pi)] = 0.05
+    frame_translation: Amount = 0.02
 
     def __post_init__(self) -> None:
-        for name, most in (("mirror", 1.0), ("dropout", 0.9), ("noise", math.inf), ("frame_rotation", math.pi)):
-            within(f"gradient.augment.{name}", getattr(self, name), 0.0, most)
-        within("gradient.augment.frame_translation", self.frame_translation, 0.0, math.inf)
+        check_fields(self, "gradient.augment.")
 
     @classmethod
     def nothing(cls) -> AugmentConfig:
@@ -154,43 +148,30 @@ class GradientConfig:
         seed: of everything drawn: pair k of a run is a function of (seed, k) alone.
     """
 
-    objective: str = "none"
-    steps: int = 200
-    batch_size: int = 8
-    part: int = 4
-    workers: int = 1
-    learning_rate: float = 0.01
-    weight_decay: float = 0.0
-    warmup: int = 10
-    final_rate: float = 0.05
-    clip: float = 1.0
+    objective: Annotated[str, OneOf(NO_STEPS, *LOSSES)] = NO_STEPS
+    steps: Count = 200
+    batch_size: Annotated[int, Within(1, 10_000)] = 8
+    part: Annotated[int, Within(1, 10_000)] = 4
+    workers: Annotated[int, Within(0, 1000)] = 1
+    learning_rate: Positive = 0.01
+    weight_decay: Amount = 0.0
+    warmup: CountOrNone = 10
+    final_rate: Share = 0.05
+    clip: Amount = 1.0
     amp: bool = False
-    device: str = "auto"
-    worlds: tuple[str, ...] = ("street",)
-    fresh: float = 1.0
-    validation: float = 0.25
-    validate_every: int = 20
-    patience: int = 5
-    checkpoint_every: int = 20
+    device: Annotated[str, OneOf("auto", "cpu", "cuda")] = "auto"
+    worlds: tuple[World, ...] = ("street",)
+    fresh: Share = 1.0
+    validation: Annotated[float, Within(0, 1, below=True)] = 0.25
+    validate_every: Count = 20
+    patience: CountOrNone = 5
+    checkpoint_every: Count = 20
     graph: bool = True
-    seed: int = 0
+    seed: Seed = 0
     augment: AugmentConfig = field(default_factory=AugmentConfig)
 
     def __post_init__(self) -> None:
-        choose("gradient.objective", self.objective, ("none", "pseudo_likelihood", "likelihood", "unrolled"))
-        choose("gradient.device", self.device, ("auto", "cpu", "cuda"))
-        for world in self.worlds:
-            choose("gradient.worlds", world, tuple(WORLDS))
-        for name in ("steps", "batch_size", "part", "validate_every", "checkpoint_every"):
-            within(f"gradient.{name}", getattr(self, name), 1, math.inf)
-        for name in ("workers", "weight_decay", "warmup", "clip", "patience", "seed"):
-            within(f"gradient.{name}", getattr(self, name), 0, math.inf)
-        for name in ("final_rate", "fresh"):
-            within(f"gradient.{name}", getattr(self, name), 0.0, 1.0)
-        if not 0 < self.learning_rate < math.inf:
-            raise ValueError(f"gradient.learning_rate: expected more than 0, got {self.learning_rate}")
-        if not 0 <= self.validation < 1:
-            raise ValueError(f"gradient.validation: expected a share in [0, 1), got {self.validation}")
+        check_fields(self, "gradient.")
         if self.batch_size % self.part:
             raise ValueError(f"gradient.part: expected a divisor of batch_size = {self.batch_size}, got {self.part}")
         if self.fresh > 0 and not self.worlds:
@@ -214,24 +195,21 @@ class DataConfig:
 
     train: tuple[str, ...] | str = ()
     test: tuple[str, ...] | str = ()
-    simulate_train: tuple[str, ...] = ("street",)
-    simulate_test: tuple[str, ...] = ("street",)
-    pairs: int = 31
-    sequences: int = 8
-    seed: int = 0
+    simulate_train: tuple[World, ...] = ("street",)
+    simulate_test: tuple[World, ...] = ("street",)
+    pairs: Annotated[int, Within(1, 100_000)] = 31
+    sequences: Annotated[int, Within(1, 100_000)] = 8
+    seed: Seed = 0
 
     def __post_init__(self) -> None:
-        for name in ("simulate_train", "simulate_test"):
-            for world in getattr(self, name):
-                choose(name, world, tuple(WORLDS))
+        check_fields(self, "data.")
 
 
 @dataclass(frozen=True)
 class Config:
-    """One run of `train.py` or of `torchcrf-scan experiment`.
+    """One training run.
 
     Attributes:
-        experiment: what `torchcrf-scan experiment` does; `train.py` does not look at it.
         output: run folder; resolved config, versions, model, metrics, events and pictures go there.
         overfit: train and test on the first training pair alone, a quick check that everything can learn.
         compare_chains: also fit and evaluate CRF-Matching and CRF-Clustering alone.
@@ -244,25 +222,30 @@ class Config:
     learning: LearningConfig = field(default_factory=LearningConfig)
     gradient: GradientConfig = field(default_factory=GradientConfig)
     unrolled: UnrolledConfig = field(default_factory=UnrolledConfig)
-    experiment: ExperimentConfig = field(default_factory=ExperimentConfig)
     output: str = "runs/default"
     overfit: bool = False
     compare_chains: bool = True
     init: str = ""
 
     def __post_init__(self) -> None:
-        other = self.gradient.objective
-        if self.learning.objective == "unrolled" and other not in ("none", "unrolled"):
-            raise ValueError(f"gradient.objective: expected unrolled with learning.objective unrolled, got {other}")
-        if self.init and self.first_order == "none":
+        check_fields(self)
+        other, staged = self.gradient.objective, self.learning.objective
+        if not LOSSES[staged].is_staged and other not in (NO_STEPS, staged):
+            raise ValueError(f"gradient.objective: expected {staged} with learning.objective {staged}, got {other}")
+        if self.init and not self.has_steps:
             raise ValueError(f"init: expected a gradient.objective to go on with from {self.init}, got none")
 
     @property
     def first_order(self) -> str:
         """The loss of first-order training: `none`, or one of `GradientConfig.objective`."""
-        return "unrolled" if self.learning.objective == "unrolled" else self.gradient.objective
+        return self.gradient.objective if LOSSES[self.learning.objective].is_staged else self.learning.objective
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether there is first-order training."""
+        return self.first_order != NO_STEPS
 
     @property
     def staged(self) -> LearningConfig:
-        """How the staged fit learns: what goes on through the unrolled iterations begins with pseudo-likelihood."""
-        return replace(self.learning, objective="pseudo_likelihood") if self.learning.objective == "unrolled" else self.learning
+        """How the staged fit learns: a loss that it does not know goes on from the fit of `STAGED`."""
+        return self.learning if LOSSES[self.learning.objective].is_staged else replace(self.learning, objective=STAGED)

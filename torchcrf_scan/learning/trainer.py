@@ -9,12 +9,13 @@ import subprocess
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from torch import Tensor
 from tqdm import tqdm
 
@@ -29,7 +30,7 @@ from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.cascade_fit import fit_cascade
-from torchcrf_scan.learning.checkpoint import Store, load_weights, write_bytes
+from torchcrf_scan.learning.checkpoint import Store, load_weights
 from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.material import Material, collect
@@ -42,6 +43,8 @@ from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.variants.register import ONE_CHAINS
+from torchcrf_scan.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -57,13 +60,13 @@ def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]
 
     resume: go on from the checkpoint in the run folder, where there is one; else begin anew.
     """
-    with join(config.gradient.device if config.first_order != "none" else "cpu") as ranks:
+    with join(config.gradient.device if config.has_steps else "cpu") as ranks:
         return train_together(config, ranks, resume=resume)
 
 
 def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dict[str, list[PairScore]]:
     """This process's share of `train`."""
-    folder = Path(config.output)
+    folder, resolved = Path(config.output), yaml.safe_dump(asdict(config), sort_keys=False)
     folder.mkdir(parents=True, exist_ok=True)
     train_pairs, test_pairs = load_data(config.data)
     if config.overfit:
@@ -77,21 +80,23 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
     began = time.perf_counter()
     store = Store(folder, settings_of(config))
     state = ranks.share(store.read() if resume and ranks.is_first else None)
-    if not resume and ranks.is_first:
-        store.path.unlink(missing_ok=True)  # of another run: this one must not go on from there
+    if ranks.is_first:
+        if not resume:
+            store.path.unlink(missing_ok=True)  # of another run: this one must not go on from there
+        write_whole(folder / "config.yaml", resolved)  # not before a run with other settings has been refused
     if resume:
         log.info("going on from step %d" if state else "no checkpoint yet, beginning anew", *([state["step"]] if state else []))
     with RunLog(folder) if ranks.is_first else nullcontext() as run:
         model = JointScanCRF(config.model)
         material = prepare(model, train_pairs, config, run, state) if run is not None else []
-        if config.first_order != "none":
+        if config.has_steps:
             ranks.share_weights(model)
             first_step = state["step"] + 1 if state else None
             with TrainingMonitor(folder, config, first_step) if ranks.is_first else nullcontext() as monitor:
                 train_by_gradient(model, config, train_pairs, held_out, store, ranks, monitor, state=state)
         cascade = None
         if run is not None:
-            if config.first_order != "none" and model.config.chains == "joint":
+            if config.has_steps and model.config.has_association and model.config.has_clusters:
                 model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
             calibrate(model, material)
             cascade = fit_baselines(material, config, run)
@@ -106,9 +111,9 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
             run.picture(test_pairs[k], answers["joint"][k], step)
         for method, of_method in scores.items():
             run.metrics(method, summarise(of_method))
-        if config.first_order == "none" and scores["joint"]:
+        if not config.has_steps and scores["joint"]:
             run.settings(flatten(config), summarise(scores["joint"]))
-    if config.first_order != "none" and scores["joint"]:
+    if config.has_steps and scores["joint"]:
         with TrainingMonitor(folder, config, config.gradient.steps + 1) as monitor:
             monitor.finished(flatten(config), summarise(scores["joint"]), config.gradient.steps)
     tables = report(scores) if scores["joint"] else []
@@ -122,7 +127,7 @@ def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], lis
     Raises:
         ValueError: too few sequences to hold one out.
     """
-    if config.first_order == "none" or config.gradient.validation == 0 or config.overfit:
+    if not config.has_steps or config.gradient.validation == 0 or config.overfit:
         return pairs, []
     try:
         return split_by_sequence(pairs, config.gradient.validation, config.gradient.seed)
@@ -171,6 +176,8 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
 
 def load_data(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
     """Training and test pairs: files, then simulated worlds."""
+    if not config.train and not config.simulate_train:
+        raise ValueError("data.simulate_train: expected a world at least where data.train names no files, got none")
 
     def load(patterns: tuple[str, ...] | str, worlds: tuple[str, ...], seed: int) -> list[ScanPair]:
         patterns = (patterns,) if isinstance(patterns, str) else patterns
@@ -194,7 +201,7 @@ def refuse_leaks(train_pairs: Sequence[ScanPair], test_pairs: Sequence[ScanPair]
 
 def fit_baselines(material: list[Material], config: Config, run: RunLog) -> Cascade | None:
     """Fits each chain alone where asked for, from the same start."""
-    if not config.compare_chains or config.model.chains != "joint":
+    if not (config.compare_chains and config.model.has_association and config.model.has_clusters):
         return None
     learning = replace(config, learning=config.staged)
     return fit_cascade(material, learning, {method: watches(run, method) for method in ("matching", "clustering")})
@@ -219,7 +226,7 @@ def watches(run: RunLog, method: str) -> dict[str, Watch]:
 
         return look
 
-    return {chain: watch(chain) for chain in ("association", "clustering", "lattice")}
+    return {chain: watch(chain) for chain in ("association", "clustering", *ONE_CHAINS)}
 
 
 @torch.no_grad()
@@ -269,7 +276,7 @@ def write_results(folder: Path, scores: dict[str, list[PairScore]], tables: Sequ
         "versions.json": json.dumps(versions(), indent=2) + "\n",
     }
     for name, content in contents.items():
-        write_bytes(folder / name, content.encode())
+        write_whole(folder / name, content)
 
 
 def versions() -> dict[str, str]:

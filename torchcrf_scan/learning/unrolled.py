@@ -25,8 +25,11 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference import joint
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import State
-from torchcrf_scan.learning.settings import UnrolledConfig
+from torchcrf_scan.learning.objectives import Objective, start_of
+from torchcrf_scan.learning.portions import Portion
+from torchcrf_scan.learning.settings import Config, UnrolledConfig
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.variants import sweep
 
 LEAST_LIKENESS = 0.5  # of a predicted mover that stands for a true one: half of its points, or a motion just within the tolerance
 TRAVEL_SHARE, LEAST_GAP = 0.15, 0.05  # tolerance of that motion: a share of the mover's travel; metres, beside twice the noise
@@ -61,6 +64,15 @@ class Sum:
         return cls(torch.where(known, losses, torch.zeros_like(losses)).sum(), known.sum().to(losses))
 
 
+def make_unrolled(config: Config) -> Objective:
+    """The objective: `unrolled_loss` at the starts of the portion."""
+
+    def unrolled(model: JointScanCRF, portion: Portion) -> dict[str, Tensor]:
+        return unrolled_loss(model, portion.batch, config.unrolled, start_of(model, portion))
+
+    return unrolled
+
+
 def unrolled_loss(
     model: JointScanCRF, batch: ScanPairBatch, config: UnrolledConfig, start: Start | None = None, **layer_inputs: Any
 ) -> dict[str, Tensor]:
@@ -89,15 +101,14 @@ def unrolled_sums(
         raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
     start = start or model.initialise(batch)
     view = model.view(batch, model.learned_inputs(batch, start, **layer_inputs))
-    rounds = joint.rounds(view, start.scaled(view.factor), model.fitted, unrolled_settings(model.config, config))
+    rounds = sweep.rounds(view, start.scaled(view.factor), model.fitted, unrolled_settings(model.config, config))
     weights = round_weights(config)
     states = [joint.merge_alike(view, done.state, model.scales.cluster_distance) for done in rounds[-len(weights) :]]
     slots = match_clusters(view.batch, states[-1], config.temperature)
-    chains = model.config.chains
     found = [
         {
-            "association": association_sum(view.batch, state, config).times(float(chains != "clustering")),
-            "cluster": cluster_sum(view.batch, state, slots, config).times(float(chains != "matching")),
+            "association": association_sum(view.batch, state, config).times(float(model.config.has_association)),
+            "cluster": cluster_sum(view.batch, state, slots, config).times(float(model.config.has_clusters)),
             **motion_sums(view.batch, state, slots, config),
         }
         for state in states
@@ -112,8 +123,7 @@ def add(sums: Sequence[Sum]) -> Sum:
 
 def unrolled_settings(model: ModelConfig, config: UnrolledConfig) -> ModelConfig:
     """The model's settings with rounds that gradients pass through."""
-    if model.inference.schedule != "sweep":
-        raise ValueError(f"schedule: expected sweep for the objective unrolled, got {model.inference.schedule}")
+    model.require("has_gradient", "for the objective unrolled")
     inference = replace(
         model.inference,
         iterations=config.iterations,

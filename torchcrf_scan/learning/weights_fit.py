@@ -12,6 +12,7 @@ from scipy.optimize import OptimizeResult, minimize
 from torch import Tensor
 
 from torchcrf_scan.inference.pseudo_likelihood import Chain, Design
+from torchcrf_scan.learning.losses import LOSSES
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.variants.lattice_likelihood import LatticeChain
 
@@ -46,7 +47,7 @@ def fit_chain(chains: Iterable[AnyChain], live: Tensor, config: LearningConfig, 
     Returns:
         (W,) float64.
     """
-    is_exact = config.objective == "likelihood"
+    is_exact = LOSSES[config.objective].is_exact
     chains = list(chains) if is_exact else chains
     design = flatten([chain.design() for chain in chains])
     done = 0

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from torchcrf_scan.loops.jit import Array, kernel
 
 BACKWARDS = 1e-4  # radians; a step back by so little is no turn
@@ -33,6 +35,26 @@ def within_circle(angle: float) -> float:
 def turn_between(before: float, after: float) -> float:
     """`rising_turn` from one bearing to another."""
     return max(within_circle(after - before + BACKWARDS) - BACKWARDS, 0.0)
+
+
+@kernel
+def rising_bearing(first: float, half: float, dx: float, dy: float) -> float:
+    """Direction of (dx, dy) on the rising scale of a scan's bearings, which begins half a step before the first one, radians."""
+    return first + within_circle(math.atan2(dy, dx) - first + half) - half
+
+
+@kernel
+def polar(points: Array, origin: Array) -> tuple[Array, Array]:
+    """(P,) ranges and (P,) rising bearings, radians, of points (P, 2) in beam order from a sensor at (2,)."""
+    ranges, bearings = np.empty(len(points)), np.empty(len(points))
+    before = 0.0
+    for i in range(len(points)):
+        x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
+        ranges[i] = math.sqrt(x * x + y * y)
+        raw = math.atan2(y, x)
+        bearings[i] = bearings[i - 1] + rising_turn(raw - before) if i > 0 else raw
+        before = raw
+    return ranges, bearings
 
 
 @kernel

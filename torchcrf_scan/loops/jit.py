@@ -22,7 +22,7 @@ Booleans = NDArray[np.bool_]
 
 SAFE_MATH = {"reassoc", "contract", "nsz", "arcp"}  # not those that assume finite numbers: impossible states are -inf
 PACKAGE = Path(__file__).parents[1]
-SOURCES = ("loops", "search", "fast", "encoder", "features", "inference")  # whose code and constants are compiled
+SOURCES = ("loops/*.py", "search/*.py", "fast/*.py", "encoder/*.py", "features/*.py", "inference/*.py", "names.py")  # compiled in
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ def cache_folder() -> str | None:
     if numba.config.CACHE_DIR:  # type: ignore[attr-defined]
         return str(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
     digest = hashlib.sha256()
-    for path in sorted(path for source in SOURCES for path in (PACKAGE / source).glob("*.py")):
+    for path in sorted(path for source in SOURCES for path in PACKAGE.glob(source)):
         digest.update(path.read_bytes())
     for parent in (PACKAGE / "loops" / "__pycache__", Path("~/.cache/torchcrf_scan").expanduser()):
         folder = parent / f"numba-{digest.hexdigest()[:16]}"

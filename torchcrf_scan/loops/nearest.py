@@ -41,7 +41,7 @@ def _merge(rows: Array) -> Array:
 
 @kernel
 def boxes_of(points: Array) -> Boxes:
-    """points: (P, 2), P >= 1."""
+    """Boxes round runs of (P, 2) points, P >= 1."""
     small = _merge(np.concatenate((points, points), axis=1))
     return Boxes(points, small, _merge(small))
 
@@ -58,7 +58,7 @@ def box_distance(box: Array, x: float, y: float) -> float:
 def nearest_within(boxes: Boxes, x: float, y: float, guess: int, least: float) -> tuple[float, int]:
     """Squared distance to and index of the nearest point that is nearer than the root of `least`, -1 where there is none.
 
-    Of points at the same distance the first. `guess` is looked at before all others, -1: none; right guesses make it fast.
+    Of points at the same distance the first. `guess` is tried first, -1: none; good guesses make the search fast.
     """
     points, small, large = boxes
     index = -1

@@ -1,4 +1,4 @@
-"""One pair of scans as the loops take it, and the start of its rounds: arrays in double precision, without padding."""
+"""One pair of scans and the start of its rounds as arrays in double precision, without padding."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcrf_scan.batch import ScanPairBatch, initial_motion_of, range_noise_of
+from torchcrf_scan.batch import ScanPairBatch, finite, initial_motion_of, range_noise_of
 from torchcrf_scan.loops.jit import Array, Booleans, Integers
 from torchcrf_scan.scan import ScanPair
 
@@ -33,12 +33,12 @@ class Pair(NamedTuple):
 
     @property
     def fewest_points(self) -> int:
-        """Of the scan that has fewer."""
+        """Number of points of the scan that has fewer."""
         return min(len(self.source), len(self.target))
 
 
 class PairStart(NamedTuple):
-    """Where the rounds of one pair of N and M points begin; the attributes are those of `inference.start.Start`.
+    """The start of the rounds of one pair of N and M points; the attributes are those of `inference.start.Start`.
 
     Attributes:
         motions: (C, 3). active: (C,). association: (N,). target_tangents: (M, 2). reach: (N, C).
@@ -54,7 +54,7 @@ class PairStart(NamedTuple):
 
 
 def array_of(values: Tensor) -> Array:
-    """In double precision, in one piece."""
+    """The tensor as a contiguous array in double precision."""
     return np.ascontiguousarray(values.detach().cpu().double().numpy())
 
 
@@ -74,27 +74,25 @@ def pair_of(batch: ScanPairBatch, b: int) -> Pair:
 
 
 def pair_of_scans(pair: ScanPair, dtype: torch.dtype) -> Pair:
-    """The pair as `ScanPairBatch.collate` would have it in a dtype, so that `match` and `forward` give the same labels."""
+    """The pair rounded to a dtype as `ScanPairBatch.collate` rounds it, so that `match` and `forward` give the same labels."""
 
-    def rounded(values: NDArray) -> Array:
-        return array_of(torch.from_numpy(values).to(dtype))
-
-    noise, dt = rounded(np.array([range_noise_of(pair), pair.dt]))
+    def rounded(name: str, values: NDArray | float) -> Array:
+        return array_of(finite(name, torch.as_tensor(values, dtype=torch.float64).to(dtype)))
 
     return Pair(
-        rounded(pair.source.points),
-        rounded(pair.target.points),
+        rounded("source", pair.source.points),
+        rounded("target", pair.target.points),
         pair.source.is_closed,
         pair.target.is_closed,
-        float(noise),
-        rounded(initial_motion_of(pair)),
+        rounded("range_noise", range_noise_of(pair)).item(),
+        rounded("initial_motion", initial_motion_of(pair)),
         np.zeros(2),
-        float(dt),
+        rounded("dt", pair.dt).item(),
     )
 
 
 def padded(parts: Sequence[NDArray], shape: tuple[int, ...], value: float | NDArray) -> Tensor:
-    """(B, *shape): every part in a corner of its own, a value elsewhere."""
+    """(B, *shape) the parts, padded with a value at the end of every axis."""
     together = np.empty((len(parts), *shape), parts[0].dtype)
     together[:] = value
     for row, part in zip(together, parts, strict=True):

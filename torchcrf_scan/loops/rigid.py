@@ -3,47 +3,107 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops.jit import Array, kernel
+from torchcrf_scan.loops.jit import Array, Integers, kernel
+
+
+class Transform(NamedTuple):
+    """A motion ready to be applied to many points: cosine and sine of its rotation, and its translation."""
+
+    cos: float
+    sin: float
+    tx: float
+    ty: float
 
 
 @kernel
 def wrap(angle: float) -> float:
-    """To (-pi, pi]."""
+    """The angle in (-pi, pi], radians."""
     return math.pi - (math.pi - angle) % (2 * math.pi)
+
+
+@kernel
+def transform_of(motion: Array) -> Transform:
+    """The transform of a motion (3,)."""
+    return Transform(math.cos(motion[0]), math.sin(motion[0]), motion[1], motion[2])
+
+
+@kernel
+def transform(by: Transform, x: float, y: float) -> tuple[float, float]:
+    """A point under a rigid motion."""
+    return by.cos * x - by.sin * y + by.tx, by.sin * x + by.cos * y + by.ty
+
+
+@kernel
+def rotate(by: Transform, x: float, y: float) -> tuple[float, float]:
+    """A direction under the motion's rotation."""
+    return by.cos * x - by.sin * y, by.sin * x + by.cos * y
+
+
+@kernel
+def rotate_back(by: Transform, x: float, y: float) -> tuple[float, float]:
+    """A direction under the inverse of the motion's rotation."""
+    return by.cos * x + by.sin * y, by.cos * y - by.sin * x
 
 
 @kernel
 def apply(motion: Array, points: Array) -> Array:
     """(P, 2) points under a motion (3,)."""
-    cos, sin = math.cos(motion[0]), math.sin(motion[0])
-    moved = np.empty_like(points)
+    by, moved = transform_of(motion), np.empty_like(points)
     for i in range(len(points)):
-        x, y = points[i, 0], points[i, 1]
-        moved[i, 0] = cos * x - sin * y + motion[1]
-        moved[i, 1] = sin * x + cos * y + motion[2]
+        moved[i, 0], moved[i, 1] = transform(by, points[i, 0], points[i, 1])
     return moved
 
 
 @kernel
+def apply_to_rows(motion: Array, points: Array, rows: Array) -> None:
+    """Writes (P, 2) points under a motion (3,) to the first two of the rows (2 or more, P or more): x and y."""
+    by = transform_of(motion)
+    for i in range(len(points)):
+        rows[0, i], rows[1, i] = transform(by, points[i, 0], points[i, 1])
+
+
+@kernel
+def apply_to_some(motion: Array, points: Array, index: Integers, rows: Array) -> None:
+    """`apply_to_rows` of the points with these indices (L,) alone. rows: (2 or more, L or more)."""
+    by = transform_of(motion)
+    for k in range(len(index)):
+        rows[0, k], rows[1, k] = transform(by, points[index[k], 0], points[index[k], 1])
+
+
+@kernel
 def inverse(motion: Array) -> Array:
-    """(3,) the motion that undoes it."""
-    cos, sin = math.cos(motion[0]), math.sin(motion[0])
+    """(3,) the inverse motion."""
     back = np.empty(3)
     back[0] = wrap(-motion[0])
-    back[1] = -cos * motion[1] - sin * motion[2]
-    back[2] = sin * motion[1] - cos * motion[2]
+    back[1], back[2] = rotate_back(transform_of(motion), -motion[1], -motion[2])
     return back
 
 
 @kernel
 def compose(after: Array, before: Array) -> Array:
-    """(3,) `before`, then `after`."""
-    cos, sin = math.cos(after[0]), math.sin(after[0])
+    """(3,) the motion `before`, then `after`."""
     both = np.empty(3)
     both[0] = wrap(after[0] + before[0])
-    both[1] = cos * before[1] - sin * before[2] + after[1]
-    both[2] = sin * before[1] + cos * before[2] + after[2]
+    both[1], both[2] = transform(transform_of(after), before[1], before[2])
     return both
+
+
+@kernel
+def motion_onto(theta: float, px: float, py: float, qx: float, qy: float) -> Array:
+    """(3,) the motion of rotation theta that takes the point p onto q."""
+    x, y = rotate(Transform(math.cos(theta), math.sin(theta), 0.0, 0.0), px, py)
+    motion = np.empty(3)
+    motion[0], motion[1], motion[2] = theta, qx - x, qy - y
+    return motion
+
+
+@kernel
+def parting(a: Transform, b: Transform, x: float, y: float) -> float:
+    """Distance between the two places of a point under two motions."""
+    ax, ay = transform(a, x, y)
+    bx, by = transform(b, x, y)
+    return math.sqrt((ax - bx) * (ax - bx) + (ay - by) * (ay - by))

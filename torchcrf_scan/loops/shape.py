@@ -1,4 +1,4 @@
-"""What the neighbourhood of every point of one scan looks like; `features.shape` in loops."""
+"""Shape descriptors of the neighbourhood of every point of one scan; `features.shape` without batches."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.features.shape import MIN_ARM, ORDERS
 from torchcrf_scan.loops.jit import Array, kernel
 from torchcrf_scan.loops.median import lower_median
 
+ORDERS = (1, 3, 5)  # "first, third or fifth neighbour"
+MIN_ARM = 1e-6  # metres; the angle between shorter arms is undefined and called straight
 FARTHEST = max(ORDERS)
 NO_SPACING = 0.1  # metres, of two scans without points
 
@@ -46,7 +47,7 @@ def arm_angle(ux: float, uy: float, vx: float, vy: float) -> float:
 
 @kernel
 def describe(points: Array, is_closed: bool) -> Shape:
-    """points: (P, 2) in beam order, P >= 0."""
+    """Shape descriptors of (P, 2) points in beam order, P >= 0."""
     P = len(points)
     distance, geodesic, angle = np.empty((P, len(ORDERS), 2)), np.empty((P, len(ORDERS), 2)), np.empty((P, len(ORDERS)))
     radius, gap = np.empty(P), np.empty(P)

@@ -1,4 +1,4 @@
-"""Work dealt out to as many threads as torch may use: compiled code holds no lock while it runs."""
+"""Work shared by as many threads as torch may use: compiled code holds no lock while it runs."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ R = TypeVar("R")
 
 @cache
 def _helpers(count: int) -> ThreadPoolExecutor:
-    """Threads beside the caller's own; kept, for starting one takes longer than many a stage."""
+    """Worker threads beside the caller's own; kept, because starting one takes longer than many a stage."""
     return ThreadPoolExecutor(count, thread_name_prefix="torchcrf_scan")
 
 
 def for_each(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
     """function(item) of every item, in order, on `torch.get_num_threads()` threads.
 
-    An item that is taken by no other thread yet is done by the next one that is free, so that long ones keep nobody waiting.
+    An item that is taken by no other thread yet is done by the next one that is free, so that no thread waits for a long one.
     """
     threads = min(torch.get_num_threads(), len(items))
     if threads < 2:

@@ -1,4 +1,4 @@
-"""The learned score of hypothesised motions, and which to accept; `inference.movers` in loops."""
+"""Probabilities of hypothesised motions by the learned score, and the greedy choice among them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.nearest import RUN, Boxes
+from torchcrf_scan.loops.rigid import apply_to_some
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.hypotheses import Hypotheses
 from torchcrf_scan.search.hypothesis_features import share_in_common
@@ -16,7 +17,6 @@ from torchcrf_scan.search.landing import (
     EXPLAINED,
     Sample,
     box_of,
-    carry_members,
     empty_sample,
     gap_squared,
     land,
@@ -26,7 +26,7 @@ from torchcrf_scan.search.landing import (
 from torchcrf_scan.search.leftover import Leftover, residual_at
 from torchcrf_scan.search.score import FEATURES, LARGEST, PRODUCTS, HypothesisScore
 
-AS_WELL = 0.5  # units; a motion that fits this much worse at most explains the points as well
+AS_WELL = 0.5  # units of mean residual up to which a worse motion still explains the same points
 APART = 4.0  # units, and half the extent, from which on two objects of one motion are two
 SHARED = 0.4  # share of points in common from which two hypotheses compete
 
@@ -45,7 +45,7 @@ class Score(NamedTuple):
 
 
 def score_of(module: HypothesisScore) -> Score:
-    """Copies them."""
+    """The buffers of the module as arrays."""
     mean, scale, weight = (buffer.detach().cpu().double().numpy() for buffer in (module.mean, module.scale, module.weight))
     return Score(mean, scale, weight, float(module.bias), float(module.threshold))
 
@@ -77,7 +77,7 @@ class _Accepted(NamedTuple):
 
 @kernel
 def select(leftover: Leftover, hypotheses: Hypotheses, probabilities: Array, threshold: float, most: int) -> Integers:
-    """(G,) numbers of the accepted hypotheses: the surest first, what competes with it is dropped, and so on.
+    """(G,) numbers of the accepted hypotheses, greedily: the most probable first, its rivals are dropped, and so on.
 
     Args:
         probabilities: (H,).
@@ -110,7 +110,7 @@ def select(leftover: Leftover, hypotheses: Hypotheses, probabilities: Array, thr
 
 @kernel
 def _surest_first(probabilities: Array, threshold: float) -> Integers:
-    """Numbers of those that are likely enough, in falling order."""
+    """Numbers of the hypotheses with at least the threshold probability (H,), the most probable first."""
     order = np.empty(len(probabilities), np.int64)
     count = 0
     for h in range(len(probabilities)):
@@ -136,7 +136,7 @@ def _has_rival(
     L: int,
     unit: float,
 ) -> bool:
-    """One of the accepted explains the same target points, or explains the members as well and may be of the same object."""
+    """Whether an accepted hypothesis explains the same target points, or the members as well and is near enough to be the same."""
     G = len(accepted)
     for g in range(G):
         if share_in_common(taken.explained[g, : taken.sizes[g]], taken.explained[G, : taken.sizes[G]]) > SHARED:
@@ -158,7 +158,7 @@ def _has_rival(
 def _residual(source: Array, target: ScanGrid, units: Array, motion: Array, index: Integers) -> float:
     """Sum of the residuals of source points (L,) under a motion (3,)."""
     moved, residual, near = np.empty((2, len(index))), np.empty(len(index)), np.empty(len(index), np.int64)
-    carry_members(source, motion, index, moved)
+    apply_to_some(motion, source, index, moved)
     residual_at(moved, target, units, residual, near)
     return float(residual.sum())
 

@@ -1,4 +1,4 @@
-"""The background's motion near a guess, and what a motion leaves unexplained; `inference.background` in loops."""
+"""Registration of the background from a guess, and the cost of a motion: the residual it leaves unexplained."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.median import lower_median
-from torchcrf_scan.loops.rigid import inverse
+from torchcrf_scan.loops.rigid import apply_to_rows, inverse, parting, transform_of
 from torchcrf_scan.search.grid import COST_SHARE, ScanGrid, share_of
-from torchcrf_scan.search.registration import carry, register, register_both, surface_residual
+from torchcrf_scan.search.registration import register, register_both, surface_residual
 from torchcrf_scan.search.surface import OCCLUDED, SEEN_THROUGH, UNMEASURED, Surface, bearing_of, look_between
 
 TRUNCATION = 3.0  # a residual of three units is as bad as any
 CONTRADICTION = 3.0  # units charged for a point that the other scan sees through (design finding 17)
 TRUSTED = 2.5  # units both ways; a guess that leaves no more unexplained once it is refined has led to the background,
 FOLLOWED = 8.0  # units; if refining has moved half of the points no farther than this
-UNSEEN = 1.5  # units charged for a point of which the other scan says nothing; else flying off the map would be free
+UNSEEN = 1.5  # units charged for a point that the other scan did not measure; else leaving the map would be free
 POLISH_GATES, POLISH_ALONG = np.array((4.0, 3.0, 2.0, 1.5)), np.array((0.1,) * 4)
 REFINE_GATES, REFINE_ALONG = np.array((3.0, 2.0, 2.0, 1.5, 1.5, 1.5)), np.array((0.03,) * 6)
 
@@ -36,13 +36,13 @@ def every(values: Array, stride: int) -> Array:
 
 @kernel
 def stride_of(points: int, most: int) -> int:
-    """Steps in which about `most` of the points are passed, 0: all of them."""
+    """Stride through the points that takes about `most` of them, 0: all."""
     return 1 if most == 0 else max(1, -(-points // most))
 
 
 @kernel
 def _charge_far(scan: Surface, moved: Array, share: Array, squared: Array, limit: float) -> float:
-    """Sum over the points whose squared residual is at least `limit`, by what the scan's beams say of them.
+    """Sum over the points whose squared residual is at least `limit`, by their free-space tests.
 
     Args:
         moved: (2 or more, P) points in the frame of `scan`. share, squared: (P,).
@@ -72,7 +72,7 @@ def _one_way(motion: Array, points: Array, share: Array, other: ScanGrid, slack:
 
     moved: (3, P) and index: (P,) are scratch space.
     """
-    carry(motion, points, moved)
+    apply_to_rows(motion, points, moved)
     squared = moved[2]
     surface_residual(moved, other, squared, index)
     limit = (TRUNCATION * slack) ** 2
@@ -85,7 +85,7 @@ def _one_way(motion: Array, points: Array, share: Array, other: ScanGrid, slack:
 
 @kernel
 def _some_of(grid: ScanGrid, stride: int) -> tuple[Array, Array]:
-    """Every stride-th point, and the share of the scan that it stands for."""
+    """Every stride-th point, (P, 2), and its share of the scan's surface, (P,)."""
     if stride == 1:
         return grid.scan.points, grid.charge
     return every(grid.scan.points, stride), share_of(every(grid.scan.length, stride), COST_SHARE[0], COST_SHARE[1])
@@ -93,7 +93,7 @@ def _some_of(grid: ScanGrid, stride: int) -> tuple[Array, Array]:
 
 @kernel
 def background_cost(motions: Array, source: ScanGrid, target: ScanGrid, most: int, slack: float) -> Array:
-    """(H,) what every motion leaves unexplained when the whole scene is taken as static, both ways (design finding 17).
+    """(H,) truncated residual of the whole scene under every motion, both ways (design finding 17).
 
     Args:
         motions: (H, 3).
@@ -119,31 +119,28 @@ def cost_of(motion: Array, source: ScanGrid, target: ScanGrid) -> float:
 
 @kernel
 def polish(motions: Array, source: ScanGrid, target: ScanGrid, unit: float) -> Array:
-    """Draws hypotheses that are still a few gates off to where `refine` can take over."""
+    """(H, 3) motions registered with wide gates, from starts (H, 3) that are a few gates off, near enough for `refine`."""
     return register(source.scan.points, source.pull, target, motions, unit * POLISH_GATES, POLISH_ALONG)
 
 
 @kernel
 def refine(motions: Array, source: ScanGrid, target: ScanGrid) -> Array:
-    """Point-to-line registration of the whole scans on each other, from good starts, by the residual that the choice goes by."""
+    """(H, 3) motions registered point-to-line by all points both ways, from good starts, by the residual of `background_cost`."""
     return register_both(source, target, motions, REFINE_GATES, REFINE_ALONG)
 
 
 @kernel
 def _median_gap(points: Array, one: Array, other: Array) -> float:
-    """How far apart two motions (3,) carry points (P, 2): the lower median, metres."""
-    here, there, gap = np.empty((2, len(points))), np.empty((2, len(points))), np.empty(len(points))
-    carry(one, points, here)
-    carry(other, points, there)
+    """Lower median over points (P, 2) of the distance between their places under two motions (3,), metres."""
+    a, b, gap = transform_of(one), transform_of(other), np.empty(len(points))
     for i in range(len(points)):
-        dx, dy = here[0, i] - there[0, i], here[1, i] - there[1, i]
-        gap[i] = math.sqrt(dx * dx + dy * dy)
+        gap[i] = parting(a, b, points[i, 0], points[i, 1])
     return lower_median(gap)
 
 
 @kernel
 def follow(guess: Array, source: ScanGrid, target: ScanGrid) -> tuple[bool, Array]:
-    """Whether a guess (3,) has led to the background, and where it has."""
+    """Whether refining a guess (3,) leads to the background, and the refined motion (3,)."""
     unit = unit_length(source.scan, target.scan)
     motion = refine(polish(guess.reshape(1, 3), source, target, unit), source, target)[0]
     is_near = _median_gap(source.scan.points, motion, guess) < FOLLOWED * unit

@@ -1,4 +1,4 @@
-"""The start of one pair from what was surveyed; `inference.initialise.choose` in loops."""
+"""Choice of the start of one pair from its survey: background, movers, reach and first associations."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torchcrf_scan.inference.start import ASSOCIATION_GATE, FOOTPRINT, REACH_EXT
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.nearest import box_distance
 from torchcrf_scan.loops.pair import PairStart
+from torchcrf_scan.loops.rigid import apply_to_rows
 from torchcrf_scan.search.accept import Score, box_round, probabilities_of, select
 from torchcrf_scan.search.grid import ScanGrid, locate
 from torchcrf_scan.search.hypotheses import Hypotheses
 from torchcrf_scan.search.leftover import Leftover
-from torchcrf_scan.search.registration import carry
 
 CONSIDERED = 0.1  # probability from which a mover is considered; the score alone accepts from its own threshold
-FEWEST_POINTS = 3  # a scan with fewer says nothing of the motion
+FEWEST_POINTS = 3  # a scan with fewer does not determine a motion
 CERTAIN = 1e-6  # probabilities are kept this far from 0 and 1
 
 
@@ -52,7 +52,7 @@ def choose_movers(
 
 @kernel
 def _reach(points: Array, members: Integers, unit: float, is_near: Booleans) -> None:
-    """Writes which points (N,) may belong to the object of these members: within half its extent and a few units of them."""
+    """Writes the points (N,) within reach of the members: half the extent of their object and a few units."""
     box = np.empty(4)
     box_round(points, members, box)
     wide, high = box[2] - box[0], box[3] - box[1]
@@ -82,7 +82,7 @@ def _associate(source: Array, target: ScanGrid, motions: Array, active: Booleans
     for c in range(len(motions)):
         if not active[c]:
             continue
-        carry(motions[c], source, moved)
+        apply_to_rows(motions[c], source, moved)
         locate(moved, target, squared, near)
         for i in range(N):
             if reach[i, c] and squared[i] < least[i]:

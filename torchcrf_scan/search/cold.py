@@ -1,4 +1,4 @@
-"""Matching by shape alone, when nothing is known of the motion; `inference.cold` in loops.
+"""Matching by shape alone, without any guess of the motion: candidates, an exact chain, two-point RANSAC.
 
 The score of all pairs of points is never held: a source point's row of it is made, its best candidates are kept, and the next row
 takes its place.
@@ -13,9 +13,12 @@ import numpy as np
 import torch
 
 from torchcrf_scan.features.potentials import REFERENCE_UNIT
-from torchcrf_scan.features.scales import KAPPA, SHAPE_CHANNELS, Scales
+from torchcrf_scan.features.scales import KAPPA, Scales
 from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.kabsch import kabsch
+from torchcrf_scan.loops.rigid import transform, transform_of
 from torchcrf_scan.loops.shape import Shape, describe, resolution
+from torchcrf_scan.names import SHAPE_CHANNELS
 from torchcrf_scan.search.surface import Surface
 
 CANDIDATES = 32
@@ -38,7 +41,7 @@ SWITCH, STAY = SWITCHING + DISTANCE * OUTLIER_DISTANCE, DISTANCE * OUTLIER_DISTA
 
 @kernel
 def _rows_of(shape: Shape) -> Array:
-    """(15, P) descriptors in units of their scales: lengths, then angles."""
+    """(15, P) descriptors in units of their scales: lengths, then angles. P: points."""
     rows = np.empty((LENGTHS + ANGLES, len(shape.radius)))
     for i in range(len(shape.radius)):
         for order in range(3):
@@ -148,7 +151,7 @@ def _edge(i: int, j: int, here: Integers, there: Integers, x: Array, y: Array, n
 def best_labels(source: Array, target: Array, index: Integers, score: Array) -> Integers:
     """(N,) target points, -1 outlier, of the best labelling of a chain: forward the best totals, back along what made them.
 
-    Where it is unique it is what the largest max-marginals say.
+    Where it is unique it is also the labelling of the largest max-marginals.
 
     Args:
         source: (N, 2), target: (M, 2) points. index, score: (N, K) candidates.
@@ -190,7 +193,7 @@ def best_labels(source: Array, target: Array, index: Integers, score: Array) -> 
 
 @kernel
 def shape_association(source: Array, target: Array, noise: float, source_closed: bool, target_closed: bool) -> Integers:
-    """(N,) associations, -1 outlier, of a chain that knows shapes and distances along the scan, not positions.
+    """(N,) associations, -1 outlier, of a chain on shapes and distances along the scan, without positions.
 
     Args:
         source: (N, 2), target: (M, 2) points in beam order. noise: metres.
@@ -209,27 +212,8 @@ def shape_association(source: Array, target: Array, noise: float, source_closed:
 
 
 @kernel
-def _two_point_motion(source: Array, target: Array, a: int, b: int, motion: Array) -> None:
-    """Writes the least-squares motion (3,) of two pairs of points, as `geometry.kabsch` has it."""
-    px, py = (source[a, 0] + source[b, 0]) / 2, (source[a, 1] + source[b, 1]) / 2
-    qx, qy = (target[a, 0] + target[b, 0]) / 2, (target[a, 1] + target[b, 1]) / 2
-    sine = cosine = size = 0.0
-    for i in (a, b):
-        x, y, u, v = source[i, 0], source[i, 1], target[i, 0], target[i, 1]
-        sine += ((x - px) * (v - qy) - (y - py) * (u - qx)) / 2
-        cosine += ((x - px) * (u - qx) + (y - py) * (v - qy)) / 2
-        size += math.sqrt((x * x + y * y) * (u * u + v * v)) / 2
-    undetermined = (
-        max(abs(sine), abs(cosine)) <= 8 * np.finfo(np.float64).eps * size
-    )  # what is left of the spread is rounding noise
-    theta = 0.0 if undetermined else math.atan2(sine, cosine)
-    cos, sin = math.cos(theta), math.sin(theta)
-    motion[0], motion[1], motion[2] = theta, qx - (cos * px - sin * py), qy - (sin * px + cos * py)
-
-
-@kernel
 def sampled_motions(source: Array, target: Array, gate: float, picks: Integers) -> tuple[Array, Integers]:
-    """(H, 3) motions of pairs of associations (H, 2), and with how many of the associations each agrees.
+    """(H, 3) motions of pairs of associations (H, 2), and (H,) number of the associations that each agrees with.
 
     Args:
         source, target: (P, 2) associated points. gate: metres.
@@ -237,20 +221,23 @@ def sampled_motions(source: Array, target: Array, gate: float, picks: Integers) 
     motions, agreeing = np.empty((len(picks), 3)), np.zeros(len(picks), np.int64)
     xs, ys = source[:, 0].copy(), source[:, 1].copy()
     us, vs = target[:, 0].copy(), target[:, 1].copy()
+    here, there = np.empty((2, 2)), np.empty((2, 2))
     for h in range(len(picks)):
-        _two_point_motion(source, target, picks[h, 0], picks[h, 1], motions[h])
-        cos, sin, tx, ty = math.cos(motions[h, 0]), math.sin(motions[h, 0]), motions[h, 1], motions[h, 2]
-        count = 0
+        for k in range(2):
+            i = picks[h, k]
+            here[k, 0], here[k, 1], there[k, 0], there[k, 1] = xs[i], ys[i], us[i], vs[i]
+        motions[h] = kabsch(here, there)
+        by, count = transform_of(motions[h]), 0
         for i in range(len(xs)):
-            dx, dy = cos * xs[i] - sin * ys[i] + tx - us[i], sin * xs[i] + cos * ys[i] + ty - vs[i]
-            count += 1 if dx * dx + dy * dy < gate * gate else 0
+            x, y = transform(by, xs[i], ys[i])
+            count += 1 if (x - us[i]) ** 2 + (y - vs[i]) ** 2 < gate * gate else 0
         agreeing[h] = count
     return motions, agreeing
 
 
 @cache
 def _picks(points: int) -> Integers:
-    """(SAMPLES, 2) the eager function's samples."""
+    """(SAMPLES, 2) pairs of points, drawn with a fixed seed."""
     return torch.randint(points, (SAMPLES, 2), generator=torch.Generator().manual_seed(0)).numpy()
 
 
@@ -268,6 +255,6 @@ def ransac_motions(source: Array, target: Array, gate: float, count: int) -> Arr
 
 
 def shape_motions(source: Surface, target: Surface, gate: float, count: int) -> Array:
-    """(count, 3) motions that `shape_association` speaks for. gate: metres."""
+    """(count, 3) two-point motions that agree with most associations of `shape_association`. gate: metres."""
     match = shape_association(source.points, target.points, source.noise, source.is_closed, target.is_closed)
     return ransac_motions(source.points[match >= 0], target.points[match[match >= 0]], gate, count)

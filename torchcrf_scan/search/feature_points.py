@@ -1,4 +1,4 @@
-"""One scan as the features of hypotheses ask for it, and the columns that they go to."""
+"""Per-point arrays of one scan for the features of hypotheses, and the columns of these features."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.search.leftover import Unexplained
 from torchcrf_scan.search.score import FEATURES
 
-JUMP = 4.0  # units of range that the beams beside an object go on, when it surely stands before them
+JUMP = 4.0  # units of range beyond an object at which the returns beside it count fully as behind it
 
 Columns: Any = cast(Any, namedtuple)("Columns", FEATURES)
 AT = Columns(*range(len(FEATURES)))  # the number of every feature's column
 
 
 class Points(NamedTuple):
-    """One scan of P points, side by side what is asked of a point.
+    """One scan of P points, the values of a point side by side in memory.
 
     Attributes:
         values: (P, 9) position, unit, residual, range, tangent, size of its segment and of its piece.
-        labels: (P, 3) segment, piece, and what the other scan's beams say of it.
+        labels: (P, 3) segment, piece, and free-space test in the other scan.
     """
 
     values: Array
@@ -36,7 +36,7 @@ SEGMENT, PIECE, SIGHT = range(3)
 
 @kernel
 def points_of(scan: Unexplained, counted: Booleans) -> Points:
-    """The scan's segments are as large as the points of theirs that are counted (P,)."""
+    """Per-point arrays of a scan; the size of a segment is the number of its points that are counted (P,)."""
     surface, P = scan.grid.scan, len(scan.units)
     segments, pieces = np.zeros(P), np.zeros(P)
     values, labels = np.empty((P, 9)), np.empty((P, 3), np.int64)
@@ -54,7 +54,7 @@ def points_of(scan: Unexplained, counted: Booleans) -> Points:
 
 @kernel
 def stands_out(scan: Array, is_closed: bool, first: int, last: int) -> float:
-    """-1 to 1: whether the returns beside both ends of a set lie behind them, or before. scan: (P, 9)."""
+    """Depth jump at both ends of a set: 1 where the returns beside it lie behind, -1 where they lie before. scan: (P, 9)."""
     P = len(scan)
     total = 0.0
     if first > 0 or is_closed:

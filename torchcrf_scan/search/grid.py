@@ -1,6 +1,6 @@
-"""One scan as others are registered on it: nearest points from a grid that is laid out once, and what is asked of every point.
+"""Grid of a scan for nearest points, laid out once, with the features of every point that registration needs.
 
-A start asks for some ten thousand nearest points of the same two scans, a search for some hundred thousand.
+A start queries some ten thousand nearest points of the same two scans, a search some hundred thousand.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ X, Y, TANGENT_X, TANGENT_Y, HALF_SPACING, UNIT = range(6)  # and what they are; 
 
 
 class ScanGrid(NamedTuple):
-    """A scan of P points as others are registered on it.
+    """A scan of P points on which others are registered.
 
     Attributes:
         scan: the scan itself.
@@ -150,7 +150,7 @@ def _lay_out(scan: Surface) -> tuple[Array, float, int, int]:
 
 @kernel
 def grid_of(scan: Surface) -> ScanGrid:
-    """Lays out the grid; some tenths of a millisecond."""
+    """The grid of a scan; takes some tenths of a millisecond."""
     points, P = scan.points, len(scan.points)
     low, per_metre, columns, rows = _lay_out(scan)
     size = 1 / per_metre

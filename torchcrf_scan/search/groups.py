@@ -1,7 +1,4 @@
-"""Sets of points that may be one object; `inference.hypotheses._groups` in loops.
-
-Sets of points are lists of indices.
-"""
+"""Groups of points that may be one object, as lists of indices."""
 
 from __future__ import annotations
 
@@ -29,7 +26,7 @@ class Groups(NamedTuple):
 
 @kernel
 def groups_of(scan: Unexplained) -> Groups:
-    """What may be one object: segments and pieces, alone and two neighbours at a time, and unexplained parts and runs."""
+    """Candidate objects: segments and pieces, alone and two neighbours at a time, and unexplained parts and runs."""
     surface, piece, residual = scan.grid.scan, scan.piece, scan.residual
     segment = surface.segment
     P = len(residual)
@@ -126,7 +123,7 @@ def _merge(index: Integers, i: int, last_i: int, j: int, last_j: int, count: int
 
 @kernel
 def _distinct(store: Groups, sets: int) -> Groups:
-    """Those of all sets that have enough points, each once; in the order of their rows of flags, as the eager module has them."""
+    """Those of all sets that have enough points, each once, in the order of their rows of flags."""
     start, index = store
     order = np.empty(sets, np.int64)
     S = count = 0

@@ -1,6 +1,6 @@
-"""Hypothesised motions of movers; `inference.hypotheses` in loops.
+"""Hypothesised motions of movers: groups of the source aligned with groups of the target.
 
-All hypotheses of one set of points follow each other: what the set alone decides is done once.
+All hypotheses of one group follow each other, so that work on the group alone is done once.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops import rigid as geometry
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.nearest import Boxes, nearest_within
+from torchcrf_scan.loops.rigid import apply, compose, motion_onto, wrap
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.groups import MIN_POINTS, Groups, ends, groups_of
 from torchcrf_scan.search.leftover import TRUNCATION, Leftover
@@ -55,7 +55,7 @@ def members_of(hypotheses: Hypotheses, which: Integers, count: int) -> Booleans:
 
 @kernel
 def hypothesise(leftover: Leftover, dt: float) -> Hypotheses:
-    """Aligns every segment holding unexplained points with every such segment of the other scan.
+    """Hypotheses that align every group with unexplained points with every such group of the other scan.
 
     By centroid and by both ends (a car is seen to another length in every scan); the best starts are registered.
 
@@ -191,7 +191,7 @@ def _screen(boxes: Boxes, units: Array, farthest: float, points: Array, shift: A
 def residual_units(boxes: Boxes, units: Array, farthest: float, x: float, y: float, guess: int) -> tuple[float, int]:
     """Distance to a scan in its local units, truncated, and the index of its nearest point, -1 where that does not matter.
 
-    units: (M,) metres, farthest: `TRUNCATION` times the largest of them. guess: index that is looked at first, -1: none.
+    units: (M,) metres, farthest: `TRUNCATION` times the largest of them. guess: index that is tried first, -1: none.
     """
     squared, index = nearest_within(boxes, x, y, guess, farthest * farthest)
     return (min(math.sqrt(squared) / units[index], TRUNCATION) if index >= 0 else TRUNCATION), index
@@ -204,7 +204,7 @@ def residual_units(boxes: Boxes, units: Array, farthest: float, x: float, y: flo
 def _settle(
     source: Array, groups: Groups, shift: Array, group: Integers, background: Array, target: ScanGrid, unit: float
 ) -> Array:
-    """(H, 3) registers every start; few points say little of a turn.
+    """(H, 3) registered motions, their turns regularised: few points determine a turn badly.
 
     Args:
         source: (P, 2). shift: (H, 2) after the background, group: (H,). unit: metres.
@@ -213,7 +213,7 @@ def _settle(
     motions, gates = np.empty((len(shift), 3)), unit * SETTLE_GATES
     points, weights = np.empty((REGISTER_POINTS, 2)), np.ones(REGISTER_POINTS)
     for h in range(len(shift)):
-        motions[h, 0] = geometry.wrap(background[0])
+        motions[h, 0] = wrap(background[0])
         motions[h, 1], motions[h, 2] = background[1] + shift[h, 0], background[2] + shift[h, 1]
     h = 0
     while h < len(shift):
@@ -235,15 +235,12 @@ def _steady(motion: Array, points: Array, heading: float, unit: float) -> Array:
     Args:
         motion: (3,). points: (L, 2). unit: metres, the error of a point.
     """
-    moved = geometry.apply(motion, points)
+    moved = apply(motion, points)
     L = len(moved)
     x = y = told = 0.0
     for i in range(L):
         x, y = x + moved[i, 0] / L, y + moved[i, 1] / L
     for i in range(L):
         told += (moved[i, 0] - x) ** 2 + (moved[i, 1] - y) ** 2
-    turn = -geometry.wrap(motion[0] - heading) / (1 + told / unit**2 * USUAL_TURN**2)
-    cos, sin = math.cos(turn), math.sin(turn)
-    back = np.empty(3)
-    back[0], back[1], back[2] = turn, x - (cos * x - sin * y), y - (sin * x + cos * y)
-    return geometry.compose(back, motion)
+    turn = -wrap(motion[0] - heading) / (1 + told / unit**2 * USUAL_TURN**2)
+    return compose(motion_onto(turn, x, y, x, y), motion)

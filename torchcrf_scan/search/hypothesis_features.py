@@ -1,7 +1,4 @@
-"""What tells a mover's motion from a wrong one; `inference.hypothesis_features` in loops.
-
-Nothing is laid out hypotheses x points: only the boxes of the target within reach of a hypothesis are looked into.
-"""
+"""Features that tell a mover's motion from a wrong one, one hypothesis at a time."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.median import lower_median
-from torchcrf_scan.loops.rigid import wrap
+from torchcrf_scan.loops.rigid import rotate_back, transform_of, wrap
 from torchcrf_scan.search.feature_points import (
     AT,
     PIECE_SIZE,
@@ -32,16 +29,19 @@ from torchcrf_scan.search.landing import EXPLAINED, Sample, empty_sample, land, 
 from torchcrf_scan.search.leftover import OPEN, Leftover
 from torchcrf_scan.search.score import FEATURES
 from torchcrf_scan.search.surface import OCCLUDED, SEEN_THROUGH, UNMEASURED
-from torchcrf_scan.search.target_features import Marks, reach_of_runs, target_features
+from torchcrf_scan.search.target_features import target_features, target_scan_of
 
 AROUND = 15  # beams
 RIVALS = 0.7  # share of points in common from which two hypotheses move nearly the same
-USUAL_UNITS, USUAL_COUNT = 2.0, 3.0  # units in all, and of how many points, that are added to those around: few say little
+USUAL_UNITS, USUAL_COUNT = (
+    2.0,
+    3.0,
+)  # units in all, and of how many points, that are added to those around, a prior against few points
 
 
 @kernel
 def hypothesis_features(leftover: Leftover, hypotheses: Hypotheses) -> Array:
-    """(H, F) what tells a mover's motion from a wrong one, in the order of `FEATURES`; shares, logarithms and local units only."""
+    """(H, F) features of the hypotheses, in the order of `FEATURES`: shares, logarithms and local units only."""
     (start, index), motions, group = hypotheses.groups, hypotheses.motions, hypotheses.group
     surface, landing, carried, background = leftover.source.grid.scan, leftover.target.grid, leftover.carried, leftover.background
     features = np.empty((len(motions), len(FEATURES)))
@@ -49,8 +49,7 @@ def hypothesis_features(leftover: Leftover, hypotheses: Hypotheses) -> Array:
     target = points_of(leftover.target, leftover.target.residual >= OPEN)
     summed, usual_range = _sums(leftover.source.residual), lower_median(surface.ranges)
     open_points = (leftover.source.residual >= OPEN).sum()
-    near, open_near = reach_of_runs(target.values)
-    sample, marks = empty_sample(), Marks(np.full(len(landing.features), -1), np.full(len(landing.features), -1))
+    sample, around = empty_sample(), target_scan_of(target, landing.scan.boxes.small)
     L, long = 0, 0.0
     for h in range(len(features)):
         s, row = group[h], features[h]
@@ -64,22 +63,22 @@ def hypothesis_features(leftover: Leftover, hypotheses: Hypotheses) -> Array:
             row[:] = features[h - 1]
         land(surface.points, landing, leftover.target.units, motions[h], sample, L)
         _source_features(source, target, sample, L, size, row)
-        _motion_features(source.values, surface.step, carried, background[0], motions[h], sample, L, long, row)
-        target_features(target, landing.scan.boxes.small, near, open_near, sample, L, size, long, marks, h, row)
+        _motion_features(source.values, surface.step, carried, background, motions[h], sample, L, long, row)
+        target_features(around, sample, L, size, long, h, row)
     _rival_features(hypotheses, features)
     return features
 
 
 @kernel
 def _sums(residual: Array) -> Array:
-    """(P + 1,) sums of all before every point."""
+    """(P + 1,) running sums of residuals (P,), beginning with 0."""
     summed = np.zeros(len(residual) + 1)
     for i in range(len(residual)):
         summed[i + 1] = summed[i] + residual[i]
     return summed
 
 
-# --- what the members decide alone --------------------------------------------------------------------------------------------
+# --- features of the members alone --------------------------------------------------------------------------------------------
 
 
 @kernel
@@ -133,7 +132,7 @@ def _extent(points: Array, index: Integers) -> tuple[float, float]:
 
 @kernel
 def _scene_features(source: Array, summed: Array, open_points: int, members: Integers, row: Array) -> None:
-    """How well the background fits the beams beside the members, and the rest of the scan. source: (P, 9)."""
+    """Writes the background's residual on the beams beside the members, and its open share of the rest. source: (P, 9)."""
     P, size = len(source), len(members)
     total = inside = 0.0
     upto = wide = open_members = 0
@@ -147,12 +146,12 @@ def _scene_features(source: Array, summed: Array, open_points: int, members: Int
     row[AT.scene_open] = (open_points - open_members) / max(P - size, 1)
 
 
-# --- what a motion decides ----------------------------------------------------------------------------------------------------
+# --- features of a motion --------------------------------------------------------------------------------------------------------
 
 
 @kernel
 def _source_features(source: Points, target: Points, sample: Sample, L: int, size: int, row: Array) -> None:
-    """How well the motion explains the members, and what it says of the points that they land on. size: of the group."""
+    """Writes the residuals and gains of the members, and shares of the points that they land on. size: of the group."""
     residual = gain = fair = 0.0
     explained = seen_through = occluded = 0
     landing_open = landing_through = landing_occluded = landing_unexcused = 0
@@ -190,12 +189,12 @@ def _source_features(source: Points, target: Points, sample: Sample, L: int, siz
 
 @kernel
 def _motion_features(
-    source: Array, step: float, carried: Array, heading: float, motion: Array, sample: Sample, L: int, long: float, row: Array
+    source: Array, step: float, carried: Array, background: Array, motion: Array, sample: Sample, L: int, long: float, row: Array
 ) -> None:
-    """How far the motion is from the background's.
+    """Writes the motion's displacement and turn against the background's.
 
     Args:
-        source: (P, 9). step: radians. carried: (P, 2), heading: radians, of the background. motion: (3,).
+        source: (P, 9). step: radians. carried: (P, 2) points under the background's motion (3,). motion: (3,).
         long: metres, extent of the members.
     """
     x = y = ranges = unit = 0.0
@@ -204,8 +203,7 @@ def _motion_features(
         x, y = x + (sample.moved[0, k] - carried[i, 0]) / L, y + (sample.moved[1, k] - carried[i, 1]) / L
         ranges, unit = ranges + source[i, RANGE] / L, unit + source[i, UNIT] / L
     length = max(math.sqrt(x * x + y * y), 1e-6)
-    cos, sin = math.cos(heading), math.sin(heading)
-    back_x, back_y = cos * x + sin * y, cos * y - sin * x  # the shift turned back, instead of every tangent ahead
+    back_x, back_y = rotate_back(transform_of(background), x, y)  # the shift turned back, instead of every tangent ahead
     along = 0.0
     for k in range(L):
         i = sample.member[k]
@@ -215,15 +213,15 @@ def _motion_features(
     row[AT.displacement_in_range] = length / ranges
     row[AT.displacement_in_extent] = math.log1p(length / max(long, 1e-6))
     row[AT.along_surface] = along / L / length
-    row[AT.rotation] = math.log1p(abs(wrap(motion[0] - heading)) / USUAL_TURN)
+    row[AT.rotation] = math.log1p(abs(wrap(motion[0] - background[0])) / USUAL_TURN)
 
 
-# --- what others explain ------------------------------------------------------------------------------------------------------
+# --- comparison with rivals ------------------------------------------------------------------------------------------------------
 
 
 @kernel
 def _rival_features(hypotheses: Hypotheses, features: Array) -> None:
-    """How much worse a hypothesis is than the best that moves nearly the same points."""
+    """Writes how much worse every hypothesis is than the best that moves nearly the same points. features: (H, F)."""
     start, index = hypotheses.groups
     S = len(start) - 1
     best = np.full((S, 3), -np.inf)  # of every group

@@ -1,13 +1,13 @@
-"""Where a hypothesis carries its members; `inference.hypothesis_features.Landing` in loops, one hypothesis at a time."""
+"""Members of a group under a hypothesised motion: residuals, nearest target points and free-space test."""
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.rigid import apply_to_some
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.hypotheses import pick
 from torchcrf_scan.search.leftover import residual_at
@@ -18,11 +18,11 @@ FEATURE_POINTS = 24
 
 
 class Sample(NamedTuple):
-    """At most `FEATURE_POINTS` members of a group, and where a hypothesis carries them.
+    """At most `FEATURE_POINTS` members of a group under a hypothesis.
 
     Attributes:
         member: (L,) index of the source. moved: (2, L). units: (L,) truncated residual. nearest: (L,) target point.
-        sight: (L,) what the target's beams say of it.
+        sight: (L,) free-space test of it in the target, see `search.surface`.
     """
 
     member: Integers
@@ -34,7 +34,7 @@ class Sample(NamedTuple):
 
 @kernel
 def empty_sample() -> Sample:
-    """Room for one."""
+    """A sample before its members are taken."""
     L = FEATURE_POINTS
     return Sample(np.empty(L, np.int64), np.empty((2, L)), np.empty(L), np.empty(L, np.int64), np.empty(L, np.int64))
 
@@ -50,23 +50,14 @@ def take_members(members: Integers, index: Integers) -> int:
 
 @kernel
 def land(points: Array, target: ScanGrid, units: Array, motion: Array, sample: Sample, L: int) -> None:
-    """Carries the members of `sample` over and looks for their nearest target points.
+    """Moves the L members of `sample` and finds residuals, nearest target points and free-space tests.
 
     points: (P, 2) of the source. units: (M,) metres. motion: (3,).
     """
-    carry_members(points, motion, sample.member[:L], sample.moved)
+    apply_to_some(motion, points, sample.member[:L], sample.moved)
     residual_at(sample.moved, target, units, sample.units[:L], sample.nearest[:L])
     for k in range(L):
         sample.sight[k] = look_along(target.scan, sample.moved[0, k], sample.moved[1, k])
-
-
-@kernel
-def carry_members(points: Array, motion: Array, index: Integers, moved: Array) -> None:
-    """Writes members (L,) of points (P, 2) under a motion (3,) to (2, L or more)."""
-    cos, sin = math.cos(motion[0]), math.sin(motion[0])
-    for k in range(len(index)):
-        x, y = points[index[k], 0], points[index[k], 1]
-        moved[0, k], moved[1, k] = cos * x - sin * y + motion[1], sin * x + cos * y + motion[2]
 
 
 @kernel

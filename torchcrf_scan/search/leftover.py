@@ -1,4 +1,4 @@
-"""What a background motion leaves unexplained; the first half of `inference.hypotheses` in loops."""
+"""The leftover of a background motion: residuals and free-space tests of both scans under it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops import rigid as geometry
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.rigid import apply, apply_to_rows, inverse
 from torchcrf_scan.search.background import unit_length
 from torchcrf_scan.search.grid import HALF_SPACING, ScanGrid, locate
-from torchcrf_scan.search.registration import carry
 from torchcrf_scan.search.surface import Surface, look_along, number_runs
 
 TRUNCATION = 3.0  # a residual of three units is as bad as any
@@ -20,13 +19,13 @@ PIECE_GAP = 2.5  # beam spacings from which two neighbours on a segment may be t
 
 
 class Unexplained(NamedTuple):
-    """One scan of P points and what the background leaves of it.
+    """One scan of P points with its residuals under the background's motion.
 
     Attributes:
         grid: the scan, for nearest points.
         units: (P,) metres, how far from a point a well registered one may lie.
         residual: (P,) units to the other scan, at most `TRUNCATION`.
-        sight: (P,) what the other scan's beams say (`surface.look_along`).
+        sight: (P,) free-space test in the other scan (`surface.look_along`).
         piece: (P,) number of every point's piece.
     """
 
@@ -38,7 +37,7 @@ class Unexplained(NamedTuple):
 
 
 class Leftover(NamedTuple):
-    """What a background motion leaves unexplained, and what else is asked of both scans again and again.
+    """Both scans under a background motion.
 
     Attributes:
         background: (3,). carried: (P, 2) source points under it.
@@ -54,11 +53,11 @@ class Leftover(NamedTuple):
 
 @kernel
 def leftover_of(source: ScanGrid, target: ScanGrid, background: Array) -> Leftover:
-    """background: (3,)."""
-    forward = geometry.apply(background, source.scan.points)
+    """The leftover of a background motion (3,)."""
+    forward = apply(background, source.scan.points)
     source_units, target_units = _point_units(source), _point_units(target)
     here = _unexplained(source, source_units, background, target, target_units)
-    there = _unexplained(target, target_units, geometry.inverse(background), source, source_units)
+    there = _unexplained(target, target_units, inverse(background), source, source_units)
     return Leftover(here, there, background, forward, unit_length(source.scan, target.scan))
 
 
@@ -81,10 +80,10 @@ def residual_at(moved: Array, grid: ScanGrid, units: Array, residual: Array, ind
 
 @kernel
 def _unexplained(grid: ScanGrid, units: Array, motion: Array, other: ScanGrid, other_units: Array) -> Unexplained:
-    """motion: (3,) into the frame of the other."""
+    """Residuals and free-space tests of a scan under a motion (3,) into the frame of the other. units: (P,), other_units: (M,)."""
     P = len(units)
     moved, residual, index, sight = np.empty((2, P)), np.empty(P), np.empty(P, np.int64), np.empty(P, np.int64)
-    carry(motion, grid.scan.points, moved)
+    apply_to_rows(motion, grid.scan.points, moved)
     residual_at(moved, other, other_units, residual, index)
     for i in range(P):
         sight[i] = look_along(other.scan, moved[0, i], moved[1, i])

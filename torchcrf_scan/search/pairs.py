@@ -1,4 +1,4 @@
-"""InitialiseRT of whole pairs (Algorithm 1, line 1): where the rounds start. It decides the result, so it is looked for with care.
+"""InitialiseRT of whole pairs (Algorithm 1, line 1): where the rounds start. It decides the result.
 
     surfaces -> background (a guess that is followed, else a search) -> what it leaves open -> hypothesised movers -> the start
 
@@ -41,7 +41,7 @@ def start_pairs(pairs: Sequence[Pair], score: Score, clusters: int) -> list[Pair
 
 
 def survey(batch: ScanPairBatch) -> list[Survey | None]:
-    """What learning needs of every pair, whatever the score of movers; see `survey_pair`."""
+    """`survey_pair` of every pair of a batch: all of the start that does not depend on the score of movers."""
     return of_pairs(survey_pair, [pair_of(batch, b) for b in range(len(batch))])
 
 

@@ -1,4 +1,4 @@
-"""The search for the background's motion where no guess leads to it: the pool of `inference.background` in loops.
+"""Search for the background's motion where no guess leads to it: a pool of hypotheses, narrowed down in stages.
 
 Every stage takes a range of hypotheses and holds no lock while it works: threads may share the hypotheses of a stage.
 """
@@ -13,7 +13,7 @@ import torch
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.median import lower_median
-from torchcrf_scan.loops.rigid import wrap
+from torchcrf_scan.loops.rigid import compose, wrap
 from torchcrf_scan.search.background import background_cost, every, polish, refine, stride_of, unit_length
 from torchcrf_scan.search.cold import shape_motions
 from torchcrf_scan.search.grid import ScanGrid
@@ -59,7 +59,7 @@ def _reach_of(source: Surface, target: Surface) -> float:
 
 def start_grid(source: Surface, target: Surface) -> Array:
     """(H, 3) turns and shifts in shares of the scene's size."""
-    reach = np.float32(GRID_REACH * _reach_of(source, target))  # single precision, as the eager grid has it
+    reach = np.float32(GRID_REACH * _reach_of(source, target))  # single precision: the labels on record depend on it
     turns, shifts = np.array(GRID_TURNS, np.float32), np.array(GRID_SHIFTS, np.float32)
     grid = np.concatenate([np.repeat(turns, len(shifts))[:, None], np.tile(shifts, (len(turns), 1)) * reach], axis=1)
     return grid.astype(np.float64)
@@ -71,17 +71,13 @@ def shifted_from(grid: Array, guesses: Array) -> Array:
     starts = np.empty((len(guesses) * len(grid), 3))
     for g in range(len(guesses)):
         for h in range(len(grid)):
-            cos, sin = math.cos(grid[h, 0]), math.sin(grid[h, 0])
-            start = starts[g * len(grid) + h]
-            start[0] = wrap(grid[h, 0] + guesses[g, 0])
-            start[1] = cos * guesses[g, 1] - sin * guesses[g, 2] + grid[h, 1]
-            start[2] = sin * guesses[g, 1] + cos * guesses[g, 2] + grid[h, 2]
+            starts[g * len(grid) + h] = compose(grid[h], guesses[g])
     return starts
 
 
 @kernel
 def search_coarsely(motions: Array, source: ScanGrid, target: ScanGrid, unit: float) -> Array:
-    """Registers some of the source's points from afar."""
+    """(H, 3) motions of some of the source's points, registered with wide gates."""
     stride = stride_of(len(source.features), COARSE_POINTS)
     points = every(source.scan.points, stride)
     return register(points, every(source.pull, stride), target, motions, unit * COARSE_GATES, COARSE_ALONG)

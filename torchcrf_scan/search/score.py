@@ -1,11 +1,11 @@
-"""."""
+"""The score of hypothesised motions: a logistic function of their features, its form and its fitted weights."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
-LARGEST = 4.0  # standard deviations; what lies beyond tells no more
+LARGEST = 4.0  # standard deviations; larger values are clipped
 
 # Feature: its mean, its scale, and the weights of the standardised feature and of its square. All weights of this file are those
 # of `learning.hypothesis_fit.fit_mixture()`.

@@ -1,4 +1,4 @@
-"""One scan seen as pieces of surface; `inference.surface` in loops, and the free-space test of single points."""
+"""One scan as pieces of surface, and the free-space test of single points."""
 
 from __future__ import annotations
 
@@ -7,20 +7,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.features.free_space import SLACK_SHARE, SLACK_STEPS, WIDEST_GAP
-from torchcrf_scan.loops.circle import rising_turn, turn_apart
+from torchcrf_scan.loops.circle import first_from, polar, rising_bearing, rising_turn
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.nearest import Boxes, boxes_of
+from torchcrf_scan.search.free_space import measured_ranges, range_slack
 
 GRAZING = math.radians(10.0)  # a surface met at a flatter angle looks like a depth jump (adaptive breakpoint detector)
 WIDEST_TURN = GRAZING * (1 - 1e-4)  # between neighbours on a surface; beams are whole steps apart, and just `GRAZING` is too far
 
-AGREES, SEEN_THROUGH, OCCLUDED, UNMEASURED = 0, 1, 2, 3  # what a beam says of a point
+AGREES, SEEN_THROUGH, OCCLUDED, UNMEASURED = 0, 1, 2, 3  # results of the free-space test
 
 
 class Surface(NamedTuple):
-    """A scan of P points with its geometry; the attributes are those of `inference.surface.Surface`."""
+    """A scan of P points with its geometry.
+
+    Attributes:
+        boxes: round runs of the points. points: (P, 2) in beam order. origin: (2,) of the sensor.
+        ranges, bearings: (P,) from there, the latter rising. spacing: (P,) metres to the nearest point on the same surface.
+        tangent: (P, 2) of the surface, 0 of a point without neighbours. length: (P,) metres of surface that a point stands for.
+        segment: (P,) number of the piece of surface. step: radians between beams. noise: metres, of a range.
+    """
 
     boxes: Boxes
     points: Array
@@ -38,7 +45,7 @@ class Surface(NamedTuple):
 
 @kernel
 def number_runs(joined: Booleans) -> Integers:
-    """(P,) numbers from 0; joined[i] says that i and i + 1 have the same, the last and the first included."""
+    """(P,) numbers from 0; joined[i]: i and i + 1 have the same, the last and the first included."""
     number = np.zeros(len(joined), np.int64)
     for i in range(1, len(joined)):
         number[i] = number[i - 1] + (0 if joined[i - 1] else 1)
@@ -52,18 +59,10 @@ def number_runs(joined: Booleans) -> Integers:
 
 @kernel
 def surface_of(points: Array, noise: float, is_closed: bool, origin: Array) -> Surface:
-    """points: (P, 2) in beam order, P >= 1; noise: metres; origin: (2,) of the sensor."""
+    """The surface of (P, 2) points in beam order, P >= 1. noise: metres; origin: (2,) of the sensor."""
     P = len(points)
-    ranges, bearings, turn = np.empty(P), np.empty(P), np.empty(P)
-    raw = np.empty(P)
-    for i in range(P):
-        x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
-        ranges[i] = math.sqrt(x * x + y * y)
-        raw[i] = math.atan2(y, x)
-    bearings[0] = raw[0]
-    for i in range(1, P):
-        bearings[i] = bearings[i - 1] + rising_turn(raw[i] - raw[i - 1])
-    gap = np.empty(P)
+    ranges, bearings = polar(points, origin)
+    turn, gap = np.empty(P), np.empty(P)
     for i in range(P):
         j = (i + 1) % P
         gap[i] = math.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
@@ -97,39 +96,28 @@ def surface_of(points: Array, noise: float, is_closed: bool, origin: Array) -> S
 
 @kernel
 def bearing_of(scan: Surface, dx: float, dy: float) -> float:
-    """The direction of (dx, dy) as a number on the scale of the scan's rising bearings."""
-    first, half = scan.bearings[0], scan.step / 2
-    turned = math.atan2(dy, dx) - first + half
-    if not 0 <= turned < 2 * math.pi:
-        turned %= 2 * math.pi
-    return first + turned - half
+    """Direction of (dx, dy) on the scale of the scan's rising bearings, radians."""
+    return rising_bearing(scan.bearings[0], scan.step / 2, dx, dy)
 
 
 @kernel
 def look_between(scan: Surface, bearing: float, after: int, reach: float) -> int:
-    """What the beams `after` - 1 and `after`, between which a bearing lies, say of a point there that is `reach` metres away."""
-    M, half = len(scan.ranges), scan.step / 2
-    if not scan.is_closed and bearing > scan.bearings[M - 1] + half:
-        return OCCLUDED
-    left, right = max(after - 1, 0), min(after, M - 1)
-    if scan.is_closed:
-        left, right = (after - 1 if after > 0 else M - 1), (after if after < M else 0)
-    apart = max(turn_apart(bearing - scan.bearings[left]), turn_apart(scan.bearings[right] - bearing))
-    if left == right:
-        apart = min(apart, half)
-    if not apart < WIDEST_GAP * scan.step:
+    """Free-space test of a point at a bearing and `reach` metres away: one of the four answers above.
+
+    after: first beam whose bearing is not less.
+    """
+    near, far = measured_ranges(scan.ranges, scan.bearings, scan.step, scan.is_closed, bearing, after)
+    slack = range_slack(reach, scan.step, scan.noise)
+    if far == np.inf:
         return UNMEASURED
-    slack = SLACK_STEPS * (scan.noise + reach * scan.step) + SLACK_SHARE * reach
-    if reach + slack < min(scan.ranges[left], scan.ranges[right]):
+    if reach + slack < near:
         return SEEN_THROUGH
-    if reach > max(scan.ranges[left], scan.ranges[right]) + slack:
-        return OCCLUDED
-    return AGREES
+    return OCCLUDED if reach > far + slack else AGREES
 
 
 @kernel
 def look_along(scan: Surface, x: float, y: float) -> int:
-    """Free-space test (design finding 13) of a point carried into the frame of `scan`: one of the four answers above."""
+    """Free-space test of a point (x, y) in the frame of `scan`: one of the four answers above."""
     dx, dy = x - scan.origin[0], y - scan.origin[1]
     bearing = bearing_of(scan, dx, dy)
-    return look_between(scan, bearing, int(np.searchsorted(scan.bearings, bearing)), math.sqrt(dx * dx + dy * dy))
+    return look_between(scan, bearing, first_from(scan.bearings, bearing), math.sqrt(dx * dx + dy * dy))

@@ -1,4 +1,4 @@
-"""What the scans of one pair say before anything learned is asked; it costs nearly all the time of InitialiseRT."""
+"""Survey of one pair before the learned score: background, leftover, hypotheses; nearly all the time of InitialiseRT."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchcrf_scan.search.surface import surface_of
 
 
 class Survey(NamedTuple):
-    """The background's motion with what it leaves open, H motions that movers may have, and (H, F) features to judge them by."""
+    """The background's motion with the points it leaves unexplained, H hypothesised motions of movers and their features (H, F)."""
 
     leftover: Leftover
     hypotheses: Hypotheses
@@ -24,14 +24,14 @@ class Survey(NamedTuple):
 
 
 def grids_of(pair: Pair) -> tuple[ScanGrid, ScanGrid]:
-    """Source and target, of at least one point each, as others are registered on them."""
+    """Grids of source and target, of at least one point each."""
     source = surface_of(pair.source, pair.noise, pair.source_closed, np.zeros(2))
     target = surface_of(pair.target, pair.noise, pair.target_closed, pair.target_origin)
     return grid_of(source), grid_of(target)
 
 
 def survey_at(source: ScanGrid, target: ScanGrid, background: Array, dt: float) -> Survey:
-    """What a motion of the background (3,) leaves, and what may have moved. dt: seconds."""
+    """Leftover of a background motion (3,), hypotheses of movers and their features. dt: seconds between the scans."""
     leftover = leftover_of(source, target, background)
     hypotheses = hypothesise(leftover, dt)
     return Survey(leftover, hypotheses, hypothesis_features(leftover, hypotheses))

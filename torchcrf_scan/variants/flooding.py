@@ -28,13 +28,13 @@ from torchcrf_scan.features.potentials import (
     registered_points,
     state_mask,
 )
-from torchcrf_scan.features.scales import ASSOCIATION_UNARY
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.inference import joint
 from torchcrf_scan.inference.messages import normalise, reduce_states
 from torchcrf_scan.inference.motion import RunningSums, retire_empty
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters, State
+from torchcrf_scan.names import ASSOCIATION_UNARY
 from torchcrf_scan.prediction import Prediction
 
 MESSAGE_TOLERANCE = 1e-3
@@ -94,10 +94,10 @@ class Flooding:
         self.sums = self._running_sums()
         found = find_candidates(self.view, self.state.motions.value, self.state.motions.active, self.config)
         order = range(batch.source.shape[1] - 1, -1, -1) if descending else range(batch.source.shape[1])
-        if self.model.chains != "matching":
+        if self.model.has_clusters:
             for i in order:
                 self.visit_cluster(i, found)
-        if self.model.chains != "clustering":
+        if self.model.has_association:
             self._take_candidates(found)
             for i in order:
                 self.visit_association(i)
@@ -156,7 +156,7 @@ class Flooding:
         association = state.association.clone()
         association[:, here] = joint.association_labels(belief[:, None].argmax(-1), states.candidates, batch.source_mask[:, here])
         state = replace(state, log_association=log_association, association=association)
-        if self.model.chains == "matching":
+        if not self.model.has_clusters:
             state = joint.inliers_are_background(state)
         self._relabel(i, state)
 

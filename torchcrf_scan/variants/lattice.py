@@ -15,11 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcrf_scan.config import InferenceConfig
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features.candidates import Candidates
 from torchcrf_scan.features.learned import association_extra, clustering_extra
 from torchcrf_scan.features.potentials import AssociationStates, PairView, possible_clusters
-from torchcrf_scan.inference.joint import association_labels, cluster_labels
+from torchcrf_scan.inference.joint import association_labels, cluster_labels, update_motions
 from torchcrf_scan.inference.messages import normalise, normalise_beliefs, reduce_states
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters, State
@@ -150,7 +150,13 @@ def _sum_messages(log_unary: Tensor, tables: Tensor, clusters: Tensor) -> tuple[
     return forward, backward.flip(1)
 
 
-def update_lattice(
+def update(view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, model: ModelConfig) -> State:
+    """The coupling `lattice` of `inference.joint.Update`: both labels of a point at once (spec 7.7), then the motions."""
+    state = update_labels(view, start, state, found, parameters, model.inference)
+    return update_motions(view, start, state, parameters, model.inference)
+
+
+def update_labels(
     view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig
 ) -> State:
     """An exact pass over the chain of super-nodes, which decides both labels of a point at once (spec 7.7)."""

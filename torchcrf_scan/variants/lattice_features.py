@@ -18,25 +18,34 @@ from torchcrf_scan.features import association, clustering
 from torchcrf_scan.features.extension import association_extension, clustering_extension
 from torchcrf_scan.features.free_space import FreeSpace, look
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, state_mask, unary_at
-from torchcrf_scan.features.scales import (
-    ASSOCIATION_UNARY,
-    ASSOCIATION_WEIGHTS,
-    CLUSTERING_UNARY,
-    STATIC_CHANNELS,
-    Scales,
-    robust_square,
-)
+from torchcrf_scan.features.scales import Scales, robust_square
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.names import (
+    ASSOCIATION_UNARY,
+    ASSOCIATION_WEIGHTS,
+    BOOSTING,
+    CLUSTERING_UNARY,
+    CLUSTERING_WEIGHTS,
+    ELASTIC,
+    LOCAL_CHANNELS,
+    STATIC_CHANNELS,
+)
 
 # Where the features' weights are among all, association before clustering.
 FIRST_CLUSTERING = len(ASSOCIATION_WEIGHTS)
 FIRST_EDGE = FIRST_CLUSTERING + CLUSTERING_UNARY
-STATIC_WEIGHTS = (*range(STATIC_CHANNELS), 13)
-MOVING_WEIGHTS = (11, 12, *range(14, ASSOCIATION_UNARY), *range(FIRST_CLUSTERING, FIRST_EDGE))
+_DATA_BOOSTING, _OUTLIER_BOOSTING = (ASSOCIATION_WEIGHTS.index(name) for name in BOOSTING)
+STATIC_WEIGHTS = (*range(STATIC_CHANNELS), _OUTLIER_BOOSTING)
+MOVING_WEIGHTS = (
+    *(*range(STATIC_CHANNELS, len(LOCAL_CHANNELS)), _DATA_BOOSTING),
+    *range(_OUTLIER_BOOSTING + 1, ASSOCIATION_UNARY),  # the association's extension
+    *range(FIRST_CLUSTERING, FIRST_EDGE),
+)
 ASSOCIATION_PAIRWISE = slice(ASSOCIATION_UNARY, FIRST_CLUSTERING)
 CLUSTER_PAIRWISE = slice(FIRST_EDGE, None)
-ELASTIC_WEIGHTS = slice(FIRST_EDGE + 3, FIRST_EDGE + 6)  # Q4..Q6, also among CLUSTER_PAIRWISE
+_FIRST_ELASTIC = FIRST_CLUSTERING + CLUSTERING_WEIGHTS.index(ELASTIC[0])
+ELASTIC_WEIGHTS = slice(_FIRST_ELASTIC, _FIRST_ELASTIC + len(ELASTIC))  # Q4..Q6, also among CLUSTER_PAIRWISE
 
 SAME, DIFFERENT, TOUCHING = range(3)  # kinds of cluster transitions: one inlier cluster, two, the outlier at an end
 ELASTIC_KINDS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))  # Q4..Q6 by kind

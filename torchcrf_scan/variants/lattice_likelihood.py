@@ -8,12 +8,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchcrf_scan.config import InferenceConfig
+from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features.candidates import with_targets
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, find_candidates, possible_clusters
-from torchcrf_scan.features.scales import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.pseudo_likelihood import Design, PlugIns, at_true_neighbours, beside_true_neighbours
 from torchcrf_scan.inference.state import Parameters
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.variants.lattice import lattice_log_partition
 from torchcrf_scan.variants.lattice_features import (
     ASSOCIATION_PAIRWISE,
@@ -112,7 +113,7 @@ def lattice_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Bo
     )
 
 
-def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Parameters, config: InferenceConfig) -> Tensor:
+def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Parameters, config: ModelConfig) -> Tensor:
     """(B,) sum over super-nodes."""
-    design = lattice_chain(view, plugins, parameters.scales, parameters.boosters, config).design()
+    design = lattice_chain(view, plugins, parameters.scales, parameters.boosters, config.inference).design()
     return design.log_likelihood(torch.cat([parameters.association, parameters.clustering])).sum(-1)

@@ -9,16 +9,16 @@ from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.candidates import by_motion
 from torchcrf_scan.features.potentials import PairView, possible_clusters
-from torchcrf_scan.features.scales import CLUSTERING_UNARY
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
 from torchcrf_scan.inference.messages import chain_beliefs
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters
+from torchcrf_scan.names import CLUSTERING_UNARY, PAPERS_CLUSTER
 from torchcrf_scan.variants.paper_start import FEWEST, match_cold
 
-PAPERS_UNARY = 4  # C1..C4; the extensions are not for so many clusters
+PAPERS_UNARY = len(PAPERS_CLUSTER)  # C1..C4; the extensions are not for so many clusters
 EDGES = 16  # whose transition tables are made at once: one has D^2 entries of 8 features
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchcrf_scan.counterparts import match_movers
+from torchcrf_scan.evaluation.counterparts import match_movers
 from torchcrf_scan.scan import BACKGROUND, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 
 ASSOCIATION_TOLERANCE = 2  # beams: an association this near is drawn as right

@@ -13,10 +13,10 @@ from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.potentials import PairView
-from torchcrf_scan.features.scales import LOCAL_CHANNELS, SHAPE_CHANNELS
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import LOCAL_CHANNELS, SHAPE_CHANNELS
 from torchcrf_scan.variants.paper_start import EXPLAINED, agreed_motion, match_cold, paper_start
 from torchcrf_scan.variants.points_start import cluster_by_point, points_start
 

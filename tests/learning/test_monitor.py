@@ -10,7 +10,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from torchcrf_scan.features.scales import LOCAL_CHANNELS
 from torchcrf_scan.learning.checkpoint import Store
 from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.monitor import GROUPS, TrainingMonitor, belief_changes, boosted_margins, named_weights
@@ -19,6 +18,7 @@ from torchcrf_scan.learning.ranks import ALONE
 from torchcrf_scan.learning.trainer import flatten, settings_of
 from torchcrf_scan.learning.validation import BASELINE, RIVAL
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import LOCAL_CHANNELS
 
 
 def read(folder: Path) -> EventAccumulator:

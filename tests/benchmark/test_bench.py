@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 import torch
 from command_line import fail, run
-from torchcrf_scan.benchmark.stages import STAGES, TABLES, calls_per_pair
 
-from torchcrf_scan.benchmark import limits, rivals
-from torchcrf_scan.benchmark.backends import installed_backends, with_backend
+from torchcrf_scan.benchmark import beside, limits, rivals
 from torchcrf_scan.benchmark.fresh import high_water_mark
-from torchcrf_scan.benchmark.machine import Rates
-from torchcrf_scan.benchmark.plan import Plan, settings_of
+from torchcrf_scan.benchmark.limits import Rates
+from torchcrf_scan.benchmark.plan import Plan, settings_of, with_backend
 from torchcrf_scan.benchmark.report import EVERYWHERE, report_tables, write_report
 from torchcrf_scan.benchmark.scenes import ODOMETRY_SHIFT, ODOMETRY_TURN, in_mode, street_pairs
 from torchcrf_scan.benchmark.study import growth_rows
@@ -24,7 +22,7 @@ from torchcrf_scan.model import JointScanCRF
 
 RATES = Rates(bandwidth=1e10, matrix=1e10, vector=1e9)
 ROW_KEYS = {"stage", "mode", "batch", "beams", "threads", "median_ms_per_pair", "runs", "backend"}
-TINY = ("--beams=[31]", "--batches=[1,2]", "--threads=[1]", "--repeats=1", "--simulated=1", "--backends=[eager]")
+TINY = ("--beams=[31]", "--batches=[1,2]", "--threads=[1]", "--repeats=1", "--simulated=1", "--backends=[compiled,eager]")
 
 
 @pytest.fixture(scope="module")
@@ -44,20 +42,17 @@ def rows_of(report: dict[str, Any], stage: str) -> list[dict[str, Any]]:
 # --- the report ---------------------------------------------------------------------------------------------------------------
 
 
-def test_whole_pairs_and_stages_have_a_time(report: dict[str, Any]) -> None:
+def test_whole_pairs_have_a_time(report: dict[str, Any]) -> None:
     whole = [row for row in rows_of(report, "whole") if row["data"] == "simulated"]
-    assert {(row["mode"], row["batch"], row["beams"], row["threads"]) for row in whole} == {
-        (mode, batch, 31, 1) for mode in ("cold", "warm") for batch in (1, 2)
+    assert {(row["backend"], row["mode"], row["batch"], row["beams"], row["threads"]) for row in whole} == {
+        (backend, mode, batch, 31, 1) for backend in ("compiled", "eager") for mode in ("cold", "warm") for batch in (1, 2)
     }
-    timed = [row for row in report["rows"] if row["stage"] in ("whole", *STAGES)]
-    assert all(row.keys() >= ROW_KEYS and row["median_ms_per_pair"] > 0 for row in timed)
-    assert {row["stage"] for row in timed} == {"whole", *STAGES}
-    assert all(row["calls_per_pair"] >= 1 for row in timed if row["stage"] != "whole")
+    assert all(row.keys() >= ROW_KEYS and row["median_ms_per_pair"] > 0 for row in whole)
 
 
 def test_recorded_pairs_are_timed_in_both_modes(report: dict[str, Any]) -> None:
     recorded = [row for row in rows_of(report, "whole") if row["data"] == "recorded"]
-    assert [row["mode"] for row in recorded] == ["cold", "warm"]
+    assert sorted(row["mode"] for row in recorded) == ["cold", "cold", "warm", "warm"]
     assert all(row["median_ms_per_pair"] > 0 for row in recorded)
 
 
@@ -66,7 +61,7 @@ def test_rivals_have_a_ratio_or_a_note(report: dict[str, Any]) -> None:
     assert {row["rival"] for row in found} == set(rivals.REGISTRATIONS)
     assert all(row["eager_to_rival"] > 0 if row["runs"] else row["note"] for row in found)
     chains = rows_of(report, "chain")
-    assert {row["decoder"] for row in chains} == set(rivals.CHAINS) - {"compiled"}
+    assert {row["decoder"] for row in chains} == set(rivals.CHAINS)
     assert {row["states"] for row in chains} == {16, 17}
     assert all(row["eager_to_this"] > 0 and row.get("same_labels", True) if row["runs"] else row["note"] for row in chains)
 
@@ -74,16 +69,19 @@ def test_rivals_have_a_ratio_or_a_note(report: dict[str, Any]) -> None:
 def test_everything_else_is_there(report: dict[str, Any]) -> None:
     assert rows_of(report, "first_call")[0]["median_ms_per_pair"] > 0
     assert rows_of(report, "peak_memory")[0]["megabytes"] > 0
-    assert all(rows_of(report, stage)[0]["seconds"] > 0 for stage in ("fit_fold", "leave_one_out_31", "training_pass_1000"))
-    assert {row["of"] for row in rows_of(report, "limit")} == {"whole", *STAGES}
-    assert all(row["eager_to_limit"] > 0 for row in rows_of(report, "limit"))
+    assert all(
+        rows_of(report, stage)[0]["seconds"] > 0
+        for stage in ("fit_fold", "leave_one_out_31", "training_pass_1000", "rounds_1", "rounds_32")
+    )
+    assert [row["mode"] for row in rows_of(report, "limit")] == ["cold", "warm"]
+    assert all(row["compiled_to_limit"] > 0 and row["eager_to_limit"] > 0 for row in rows_of(report, "limit"))
     assert report["machine"]["torch"] == torch.__version__
     assert {"cpu_count", "numba"} <= report["machine"].keys()
 
 
 def test_tables_tell_every_kind_of_row(report: dict[str, Any]) -> None:
     titles = [table.title for table in report_tables(report["rows"], RATES)]
-    assert len(titles) == 8  # no growth from one number of beams
+    assert len(titles) == 7  # no growth from one number of beams, nothing beside
     assert all("nan" not in table.to_markdown() for table in report_tables(report["rows"], RATES))
 
 
@@ -182,13 +180,11 @@ def test_work_of_a_chain_is_counted_by_hand() -> None:
     assert work.bytes == 8 * 10 * (2 * 9 + 2 * 3)
 
 
-def test_whole_work_is_the_sum_and_grows() -> None:
-    work = limits.count_work(limits.Size())
-    parts = [value for name, value in work.items() if name != "whole"]
-    assert work["whole"].operations == pytest.approx(sum(part.operations for part in parts))
-    assert set(work) == {"whole", *STAGES}
-    twice = limits.count_work(limits.Size(points=722))
-    assert all(twice[name].operations > value.operations for name, value in work.items())
+def test_work_grows_with_the_points_and_without_a_prior() -> None:
+    once, twice = limits.count_work(limits.Size()), limits.count_work(limits.Size(points=722))
+    assert twice.operations > once.operations > 0
+    assert twice.bytes > once.bytes > 0
+    assert limits.count_work(limits.Size(is_warm=True)).operations < once.operations
     assert limits.Work(2e10, 1e10).milliseconds(RATES) == pytest.approx(2000.0)
 
 
@@ -218,7 +214,7 @@ def test_high_water_mark_is_read() -> None:
     assert high_water_mark("Name:\tpython\nVmHWM:\t    2048 kB\n") == 2.0
 
 
-# --- backends and stages ------------------------------------------------------------------------------------------------------
+# --- backends, another checkout -----------------------------------------------------------------------------------------------
 
 
 def test_backend_changes_the_config_alone() -> None:
@@ -226,18 +222,24 @@ def test_backend_changes_the_config_alone() -> None:
     other = with_backend(model, "eager")
     assert other.association_weights is model.association_weights
     assert other.config.inference.candidates == model.config.inference.candidates
-    assert "eager" in installed_backends()
 
 
-def test_calls_follow_the_rounds() -> None:
-    calls = calls_per_pair(1.0)
-    assert set(calls) == set(STAGES)
-    assert (calls["mover_selection"], calls["motion_updates"], calls["initialisation"]) == (1.0, 2.0, 1.0)
+def test_another_checkout_is_asked_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = Path(beside.__file__).parents[2]  # this one beside itself
+    monkeypatch.setattr(beside, "TASKS", {"cold, one pair": "match", "a batch of gradients": "rounds"})
+    rows = beside.compare(street_pairs(31, 1), "simulated", tree, repeats=1)
+    assert [row["task"] for row in rows] == ["cold, one pair", "a batch of gradients"]
+    assert all(row["ratio"] == pytest.approx(row["ms_per_pair"] / row["other_ms_per_pair"]) for row in rows)
+    assert "Beside another checkout" in [table.title for table in report_tables(rows, RATES)]
 
 
-def test_compiled_stages_run() -> None:
-    pytest.importorskip("numba")
-    stages = TABLES["compiled"](JointScanCRF.from_pretrained(), street_pairs(31, 2))
-    assert set(stages) <= set(STAGES)
-    for call in stages.values():
-        call()
+def test_a_folder_without_the_package_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="--beside: expected a folder that holds torchcrf_scan"):
+        beside.compare(street_pairs(31, 1), "simulated", tmp_path, repeats=1)
+
+
+def test_a_process_that_fails_is_told(tmp_path: Path) -> None:
+    (tmp_path / "torchcrf_scan").mkdir()
+    (tmp_path / "torchcrf_scan" / "__init__.py").write_text("raise SystemExit(3)")
+    with pytest.raises(ValueError, match="ended with 3"):
+        beside.compare(street_pairs(31, 1), "simulated", tmp_path, repeats=1)

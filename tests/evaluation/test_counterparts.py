@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchcrf_scan.counterparts import match_movers, movers_in_order
+from torchcrf_scan.evaluation.counterparts import match_movers, movers_in_order
 
 
 def test_the_largest_overlap_in_all_wins() -> None:

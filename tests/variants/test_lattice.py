@@ -42,12 +42,12 @@ from torchcrf_scan.features.potentials import (
 )
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference import joint
 from torchcrf_scan.inference.messages import chain_beliefs, log_partition
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
 from torchcrf_scan.prediction import Prediction
+from torchcrf_scan.variants import sweep
 from torchcrf_scan.variants.lattice import LatticeBeliefs, lattice_beliefs, lattice_log_partition, lattice_messages
 from torchcrf_scan.variants.lattice_features import LatticeFeatures, LatticePotentials, lattice_features, transition_kinds
 
@@ -370,7 +370,7 @@ def decode(
     batch: ScanPairBatch, start: Start, settings: ModelConfig | None = None, parameters: Parameters | None = None
 ) -> Prediction:
     with torch.no_grad():
-        return joint.decode(PairView.of(batch), start, parameters or WEIGHTS, settings or config())
+        return sweep.decode(PairView.of(batch), start, parameters or WEIGHTS, settings or config())
 
 
 def test_a_clean_scene_is_solved() -> None:

@@ -16,14 +16,15 @@ from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, find_candidates, possible_clusters
-from torchcrf_scan.features.scales import LOCAL_CHANNELS, Scales
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.inference.state import Parameters
-from torchcrf_scan.learning.fit import Lesson, fit_lattice
+from torchcrf_scan.learning.fit import Lesson, fit_one_chain
 from torchcrf_scan.learning.plugins import training_plugins
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.learning.weights_fit import fit_chain, flatten, stack
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.names import LOCAL_CHANNELS
 from torchcrf_scan.variants.lattice_features import LatticeFeatures, lattice_features
 from torchcrf_scan.variants.lattice_likelihood import LatticeChain, lattice_chain, pseudo_log_likelihood
 
@@ -76,7 +77,7 @@ def test_both_equal_the_loops(seed: int) -> None:
     expected = oracles.conditionals(local, pairwise, STATES, weights.numpy())
     assert_close(design.log_likelihood(extended(weights))[0], expected, tolerance=1e-6)  # tables of stumps are summed in float32
     parameters = Parameters(extended(weights[:18]), extended(weights[18:]), scales, boosters)
-    assert_close(pseudo_log_likelihood(view, plugins, parameters, DENSE), [sum(expected)], tolerance=1e-6)
+    assert_close(pseudo_log_likelihood(view, plugins, parameters, ModelConfig(inference=DENSE)), [sum(expected)], tolerance=1e-6)
     scores = local @ weights.numpy(), pairwise @ weights.numpy()
     exact = oracles.score(*scores, STATES) - oracles.log_partition(*scores)
     assert_close(chain.log_likelihood(extended(weights)), [exact], tolerance=1e-6)
@@ -205,7 +206,7 @@ def test_a_fit_improves_both(objective: str, raw_channels: bool) -> None:
     before = values()
     seen: list[float] = []
     config = LearningConfig(objective=objective, max_steps=30)
-    fit_lattice(model, taught, {0: model.boosters}, config, lambda step, loss, *_: seen.append(loss))
+    fit_one_chain(model, lattice_chain, taught, {0: model.boosters}, config, lambda step, loss, *_: seen.append(loss))
     after = values()
     assert after[0] > before[0]
     assert after[1] > before[1]

@@ -1,0 +1,44 @@
+"""A file is there whole or not at all, and the one before stays."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from torchcrf_scan.whole_file import write_whole
+
+
+def fail(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("content", ["text, \u00fc", b"bytes"])
+def test_what_is_written_takes_the_place_of_what_was_there(content: str | bytes, tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"before")
+    write_whole(tmp_path / "file", content)
+    assert (tmp_path / "file").read_bytes() == (content.encode() if isinstance(content, str) else content)
+    assert [of.name for of in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_what_cannot_be_written_leaves_the_file_before(call: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_whole(tmp_path / "file", b"good")
+    monkeypatch.setattr(os, call, fail)
+    with pytest.raises(OSError, match="No space left on device"):
+        write_whole(tmp_path / "file", b"other")
+    assert (tmp_path / "file").read_bytes() == b"good"
+    assert [of.name for of in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_disk_that_is_full_in_earnest(tmp_path: Path) -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("needs /dev/full")
+    path = tmp_path / "file"
+    write_whole(path, b"good")
+    (tmp_path / f".file.{os.getpid()}").symlink_to(full)
+    with pytest.raises(OSError, match="No space left on device"):
+        write_whole(path, b"x" * 100_000)
+    assert path.read_bytes() == b"good"
+    assert [of.name for of in tmp_path.iterdir()] == ["file"]

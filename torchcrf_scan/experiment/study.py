@@ -1,0 +1,63 @@
+"""The pairs of an experiment and what is found in them once for all folds."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from joblib import Parallel, delayed
+
+from torchcrf_scan.baselines.icp import GATES, found_shares
+from torchcrf_scan.experiment.settings import RunConfig
+from torchcrf_scan.learning.fit import Margins
+from torchcrf_scan.learning.material import Collection, collect
+from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.scan import Floats, ScanPair
+
+Features = tuple[JointScanCRF, Margins]  # a model whose scales and boosters were fitted, and its out-of-fold boosters
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """The pairs of an experiment and what is found in them once for all folds.
+
+    Attributes:
+        pairs: P annotated pairs. collection: the same, as learning sees them.
+        icp_shares: (P, G) outliers that ICP finds with every one of its `GATES`.
+        kept: folder of scales and boosters that were fitted, for variants of the model that share them; None: none are kept.
+    """
+
+    pairs: tuple[ScanPair, ...]
+    collection: Collection
+    icp_shares: Floats
+    kept: Path | None = None
+
+    @classmethod
+    def of(cls, pairs: Sequence[ScanPair], config: RunConfig, jobs: int) -> Study:
+        """Looks at the pairs, on `jobs` cores. Raises ValueError for pairs without annotation."""
+        collection = collect(pairs, config.learning, jobs)
+        if config.experiment.joint_alone:
+            return cls(tuple(pairs), collection, np.zeros((len(pairs), len(GATES))))
+        shares = Parallel(n_jobs=jobs)(delayed(found_shares)(pair, GATES) for pair in pairs)
+        return cls(tuple(pairs), collection, np.stack(shares))
+
+    def features_of(self, key: str) -> Features | None:
+        """Scales and boosters that were kept under a key."""
+        place = self._place(key)
+        return pickle.loads(place.read_bytes()) if place is not None and place.is_file() else None
+
+    def keep(self, key: str, features: Features) -> None:
+        """Keeps them where others find them, in this process or another; whole or not at all."""
+        place = self._place(key)
+        if place is not None and not place.is_file():
+            temporary = place.with_suffix(f".{os.getpid()}")
+            temporary.write_bytes(pickle.dumps(features))
+            os.replace(temporary, place)
+
+    def _place(self, key: str) -> Path | None:
+        return self.kept and self.kept / hashlib.sha256(key.encode()).hexdigest()
