@@ -61,6 +61,14 @@ def compiled(model: JointScanCRF, batch: ScanPairBatch, start: Start) -> arrays.
     )
 
 
+@cache
+def both(seed: int, fov: float) -> tuple[decode.Decoded, Prediction]:
+    """The answers of loops and of tensors from the same start."""
+    batch = simulated(seed, fov)
+    start = layer().initialise(batch)
+    return compiled(layer(), batch, start), layer()(batch, start)
+
+
 def lead_over(log_beliefs: np.ndarray, best: np.ndarray, other: np.ndarray) -> np.ndarray:
     """(N,) how much likelier one state (N,) is than another (N,), in nats; infinite where the other is impossible."""
     rows = np.arange(len(log_beliefs))
@@ -116,9 +124,7 @@ def assert_same_answer(found: arrays.Decoded, expected: Prediction) -> None:
 
 @pytest.mark.parametrize(("seed", "fov"), [(0, 180.0), (1, 180.0), (2, 360.0), (3, 360.0)])
 def test_simulated_pairs_are_decoded_alike(seed: int, fov: float) -> None:
-    batch = simulated(seed, fov)
-    start = layer().initialise(batch)
-    assert_same_answer(compiled(layer(), batch, start), layer()(batch, start))
+    assert_same_answer(*both(seed, fov))
 
 
 @pytest.mark.parametrize("name", CONFIGS)
@@ -200,9 +206,7 @@ def altered(decoded: arrays.Decoded, **values: Any) -> arrays.Decoded:
 
 
 def test_the_comparison_sees_every_difference() -> None:
-    batch = simulated(0)
-    start, model = layer().initialise(batch), layer()
-    found, expected = compiled(model, batch, start), model(batch, start)
+    found, expected = both(0, 180.0)
     assert_same_answer(found, expected)
     other = (found.cluster[0] + 1) % 3
     with pytest.raises(AssertionError, match=rf"cluster of 1 of \d+ points: point 0: {other}, expected {found.cluster[0]}"):
@@ -215,9 +219,7 @@ def test_the_comparison_sees_every_difference() -> None:
 
 
 def test_a_tie_may_be_broken_either_way() -> None:
-    batch = simulated(0)
-    start, model = layer().initialise(batch), layer()
-    found, expected = compiled(model, batch, start), model(batch, start)
+    found, expected = both(0, 180.0)
     tied = expected.log_cluster.clone()
     tied[0, 0] = -1.0  # all clusters of point 0 are equally likely
     found = altered(found, cluster=(found.cluster[0] + 1) % 3)
