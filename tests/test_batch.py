@@ -9,6 +9,7 @@ from support import assert_close
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.loops.pair import pair_of_scans
 from torchcrf_scan.prediction import Prediction, Uncertainty
 from torchcrf_scan.scan import Annotation, Scan, ScanPair
 
@@ -333,3 +334,16 @@ def test_a_guess_of_the_motion_comes_along() -> None:
     for wrong in (np.zeros(2), np.array([0.0, np.nan, 0.0])):
         with pytest.raises(ValueError, match="initial_motion: expected three finite numbers"):
             ScanPairBatch.collate([ScanPair(scan, scan, initial_motion=wrong)])
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
+def test_numbers_that_a_dtype_does_not_hold_are_refused(dtype: torch.dtype) -> None:
+    beyond = 2.0 * torch.finfo(dtype).max
+    far = Scan(np.array([beyond]), np.zeros(1), np.arange(1), 1)
+    near = Scan.from_ranges([1.0], [0.0])
+    for side, pair in (("source", ScanPair(far, near)), ("target", ScanPair(near, far)), ("dt", ScanPair(near, near, dt=beyond))):
+        with pytest.raises(ValueError, match=f"^{side}: expected finite numbers of {dtype}, got inf$"):
+            ScanPairBatch.collate([pair], dtype)
+        with pytest.raises(ValueError, match=f"^{side}: expected finite numbers of {dtype}, got inf$"):
+            pair_of_scans(pair, dtype)
+    assert len(ScanPairBatch.collate([ScanPair(far, far)], torch.float64)) == 1

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from jsonargparse import ArgumentParser
 from support import PAPER_WEIGHTS
 
 from torchcrf_scan.commands.experiment import read_variants
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.experiment.parser import config_of, settings_parser
 from torchcrf_scan.experiment.settings import ExperimentConfig, RunConfig
 from torchcrf_scan.features.scales import live_weights
 from torchcrf_scan.learning.settings import LearningConfig
@@ -23,11 +23,8 @@ FILES = sorted(path.name for path in CONFIGS.glob("*.yaml"))
 
 
 def parse(*arguments: str) -> RunConfig:
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_argument("--config", action="config")
-    parser.add_class_arguments(RunConfig)
-    settings = parser.instantiate(parser.parse_args(list(arguments)))
-    return RunConfig(**{name: value for name, value in settings.items() if name != "config"})
+    parser = settings_parser(exit_on_error=False)
+    return config_of(parser.instantiate(parser.parse_args(list(arguments))))
 
 
 def load(name: str, *arguments: str) -> RunConfig:

@@ -1,6 +1,5 @@
 """The layer as its users meet it: named weights, saving, one pair and many, gradients."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -234,38 +233,11 @@ def test_a_saved_model_answers_as_before(layer: type[JointScanCRF], pairs: list[
     assert sorted(path.name for path in (tmp_path / "model").iterdir()) == ["config.json", "model.safetensors"]
 
 
-def test_settings_of_the_inference_may_change_on_loading(tmp_path: Path) -> None:
-    model = randomise(make_model(candidates=5))
-    model.save_pretrained(tmp_path)
-    again = JointScanCRF.from_pretrained(tmp_path, candidates=0, schedule="flooding")
-    assert again.config.inference == replace(model.config.inference, candidates=0, schedule="flooding")
-    with pytest.raises(ValueError, match="schedule: expected one of sweep, flooding, got slow"):
-        JointScanCRF.from_pretrained(tmp_path, schedule="slow")
-    with pytest.raises(TypeError, match="speed"):
-        JointScanCRF.from_pretrained(tmp_path, speed=3)
-
-
-def test_a_saved_config_can_be_read(tmp_path: Path) -> None:
-    make_model(MatchingCRF, clusters=5).save_pretrained(tmp_path)
-    values = json.loads((tmp_path / "config.json").read_text())
-    assert values["chains"] == "matching"
-    assert values["inference"]["clusters"] == 5
-
-
 def test_saving_twice_keeps_the_last(tmp_path: Path) -> None:
     JointScanCRF().save_pretrained(tmp_path)
     second = randomise(JointScanCRF())
     second.save_pretrained(tmp_path)
     assert_close(JointScanCRF.from_pretrained(tmp_path).weight_vectors[0].detach(), second.weight_vectors[0].detach())
-
-
-def test_an_unknown_name_lists_the_shipped_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("one", "other"):
-        JointScanCRF().save_pretrained(tmp_path / "weights" / name)
-    monkeypatch.setattr("torchcrf_scan.pretrained.files", lambda package: tmp_path)
-    with pytest.raises(ValueError, match=r"expected a folder with config\.json or one of one, other shipped models, got nowhere"):
-        JointScanCRF.from_pretrained("nowhere")
-    assert len(JointScanCRF.from_pretrained("other").state_dict()) > 30
 
 
 def test_state_dict_round_trip() -> None:

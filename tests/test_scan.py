@@ -107,3 +107,38 @@ def test_a_scan_does_not_change() -> None:
     scan = Scan.from_ranges([1.0], [0.0])
     with pytest.raises(FrozenInstanceError):
         scan.n_beams = 2
+
+
+# --- numbers that no sensor gives ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [1e6, 1e12, 1e20, 1e38, 1e39, 1e300, np.inf])
+def test_what_is_too_far_for_a_sensor_is_no_return(value: float) -> None:
+    assert Scan.from_ranges([1.0, value, 2.0], [0.0, 0.1, 0.2]).beam.tolist() == [0, 2]
+    assert len(Scan.from_ranges([value], [0.0])) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("range_noise", (np.nan, np.inf, -0.01, 1e39)),
+        ("range_max", (np.nan, 0.0, -1.0)),
+        ("range_min", (np.nan, np.inf, -np.inf)),
+    ],
+)
+def test_a_sensor_that_cannot_be_is_refused(name: str, values: tuple[float, ...]) -> None:
+    for value in values:
+        with pytest.raises(ValueError, match=rf"^{name}: expected .*, got {value}$"):
+            Scan.from_ranges([1.0, 2.0], [0.0, 0.1], **{name: value})  # type: ignore[arg-type]
+
+
+def test_limits_that_leave_nothing_between_them_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"^range_max: expected more than range_min = 5.0, got 5.0$"):
+        Scan.from_ranges([1.0, 2.0], [0.0, 0.1], range_min=5.0, range_max=5.0)
+    assert len(Scan.from_ranges([1.0, 2.0], [0.0, 0.1], range_max=np.inf)) == 2  # no limit
+
+
+def test_beams_that_all_go_one_way_are_refused() -> None:
+    with pytest.raises(ValueError, match="^angle_increment: expected more than 0, got 0$"):
+        Scan.from_ranges([1.0, 2.0], angle_min=0.0, angle_increment=0.0)
+    assert len(Scan.from_ranges([1.0], angle_min=0.0, angle_increment=0.0)) == 1

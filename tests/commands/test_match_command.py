@@ -199,7 +199,7 @@ def test_match_names_the_bad_argument(pairs_dir: Path, model_dir: Path, tmp_path
     assert "nowhere" in fail(capsys, "match", tmp_path / "nowhere", "--output", tmp_path / "out")
     assert "--model no_such_model" in message("--model", "no_such_model")
     assert "--threads: expected at least 1" in message("--model", model_dir, "--threads=0")
-    assert "candidates: expected 0 or more" in message("--model", model_dir, "--candidates=-1")
+    assert "candidates: expected a whole number in [0, 256], got -1" in message("--model", model_dir, "--candidates=-1")
     assert "--device: expected" in message("--model", model_dir, "--device=abacus")
     assert "--every: expected at least 1" in message("--every=0")
     assert "--every: expected a log" in message("--every=2")

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from made_up import RIVAL, Recorder, guess, make_pairs, make_study
 
 from torchcrf_scan.experiment import cross_validation
@@ -78,6 +80,25 @@ def test_file_names() -> None:
     assert file_name("K-Means (ICP), ego removed") == "K-Means_ICP_ego_removed"
     assert file_name("../..") == ".._.."
     assert file_name("/") == file_name("") == "unnamed"
+
+
+@given(st.text() | st.sampled_from([".", "..", "...", "./.", "x" * 300, "\u00e9" * 200]))
+def test_a_file_name_stays_in_its_folder(name: str) -> None:
+    found = file_name(name)
+    assert "/" not in found
+    assert found.strip(".")
+    assert len(found.encode()) <= 200  # of 255, an ending being added
+    assert found == file_name(name)
+
+
+def test_long_names_that_begin_alike_differ() -> None:
+    assert file_name("x" * 300) != file_name("x" * 301)
+    assert file_name("x" * 100) == "x" * 100
+
+
+@pytest.mark.parametrize("last", ["..", "."])
+def test_a_sequence_named_like_a_folder_gets_a_name_of_its_own(last: str) -> None:
+    assert [fold.name for fold in make_folds(BY_SEQUENCE, make_pairs("a", "b", last), 3)] == ["a", "b", "unnamed"]
     assert len({file_name(method) for method in METHODS}) == len(METHODS)
 
 

@@ -73,6 +73,15 @@ def test_resuming_a_finished_run_changes_nothing(run: Path, arguments: list[str]
     assert ((run / "model" / "model.safetensors").read_bytes(), (run / "metrics.json").read_bytes()) == before
 
 
+def test_a_refused_run_leaves_the_folder_as_it_was(run: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "config.yaml").read_text()
+    assert load_main()([*arguments, f"--output={run}", "--resume", "--learning.prior=3"]) == 1
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("train.py: error: resume: expected the settings of the run")
+    assert "learning.prior = '3.0' after '10.0'" in error
+    assert (run / "config.yaml").read_text() == before
+
+
 def test_training_can_begin_from_a_saved_model(run: Path, arguments: list[str], tmp_path: Path) -> None:
     load_main()([*arguments, f"--output={tmp_path}", f"--init={run / 'model'}", "--gradient.steps=1", "--gradient.validation=0"])
     first = JointScanCRF.from_pretrained(run / "model")
@@ -88,7 +97,7 @@ def test_the_saved_config_is_read_again(run: Path, capsys: pytest.CaptureFixture
     assert "frame_rotation" in text
     with pytest.raises(SystemExit):
         load_main()([f"--config={run / 'config.yaml'}", "--gradient.steps=0"])
-    assert "gradient.steps: expected 1 or more, got 0" in capsys.readouterr().err
+    assert "gradient.steps: expected a whole number in [1, 1000000], got 0" in capsys.readouterr().err
 
 
 def test_help_tells_of_every_setting(capsys: pytest.CaptureFixture[str]) -> None:
@@ -111,15 +120,15 @@ def test_help_tells_of_every_setting(capsys: pytest.CaptureFixture[str]) -> None
         ("device", "tpu", "expected one of auto, cpu, cuda, got tpu"),
         ("worlds", ("moon",), "expected one of .*, got moon"),
         ("worlds", (), "expected at least one"),
-        ("steps", 0, "expected 1 or more, got 0"),
+        ("steps", 0, r"expected a whole number in \[1, 1000000\], got 0"),
         ("part", 3, "expected a divisor of batch_size = 8, got 3"),
-        ("workers", -1, "expected 0 or more, got -1"),
-        ("learning_rate", 0.0, "expected more than 0, got 0.0"),
-        ("learning_rate", float("nan"), "expected more than 0, got nan"),
-        ("clip", float("nan"), "expected 0 or more, got nan"),
-        ("fresh", 1.5, r"expected a number in \[0.0, 1\], got 1.5"),
-        ("validation", 1.0, r"expected a share in \[0, 1\), got 1.0"),
-        ("seed", -1, "expected 0 or more, got -1"),
+        ("workers", -1, r"expected a whole number in \[0, 1000\], got -1"),
+        ("learning_rate", 0.0, "expected a finite number above 0, got 0.0"),
+        ("learning_rate", float("nan"), "expected a finite number above 0, got nan"),
+        ("clip", float("nan"), "expected a finite number, 0 or more, got nan"),
+        ("fresh", 1.5, r"expected a finite number in \[0, 1\], got 1.5"),
+        ("validation", 1.0, r"expected a finite number in \[0, 1\), got 1.0"),
+        ("seed", -1, r"expected a whole number in \[0, 2147483647\], got -1"),
     ],
 )
 def test_values_out_of_range_are_named(name: str, value: object, expected: str) -> None:

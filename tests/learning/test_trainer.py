@@ -20,13 +20,13 @@ METHODS = ("joint", "CRF-Matching", "CRF-Clustering")
 SMALL = ("--data.pairs=6", "--data.sequences=3", "--learning.folds=2", "--model.features.stumps=15", "--learning.max_steps=40")
 
 
-def load_main() -> Callable[[list[str]], None]:
+def load_main() -> Callable[[list[str]], int]:
     spec = importlib.util.spec_from_file_location("train", ROOT / "train.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    main: Callable[[list[str]], None] = module.main
+    main: Callable[[list[str]], int] = module.main
     return main
 
 
@@ -146,3 +146,27 @@ def test_simulated_training_and_test_pairs_share_nothing() -> None:
 def test_no_test_pair_is_no_error() -> None:
     train, test = load_data(DataConfig(simulate_test=(), pairs=1, sequences=1))
     assert (len(train), len(test)) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--data.simulate_train=[]"], "data.simulate_train: expected a world at least where data.train names no files, got none"),
+        (["--data.train=/nosuch"], "patterns: expected /nosuch to match pair files"),
+        (["--init=nosuch", "--gradient.objective=unrolled"], "name_or_path: expected a folder with config.json or one of"),
+    ],
+)
+def test_bad_input_is_one_line(arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert load_main()([*SMALL, *arguments, f"--output={tmp_path}"]) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith(f"train.py: error: {message}")
+    assert not (tmp_path / "config.yaml").exists()
+
+
+def test_bad_settings_are_bad_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        load_main()(["--data.pairs=0", f"--output={tmp_path / 'run'}"])
+    assert left.value.code == 2
+    assert "error: data.pairs: expected a whole number in [1, 100000], got 0" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -98,6 +98,21 @@ def test_the_labelling_is_the_best_of_all(n: int, m: int, K: int, on_a_line: boo
         assert tuple(states) == oracles.best_labelling(nodes, steps)
 
 
+@pytest.mark.parametrize("first", [-1.0, -30.0])
+@pytest.mark.parametrize("step", [0.0, 0.4, 30.0])
+@pytest.mark.parametrize("index", [[[0], [1]], [[0], [2]]])
+def test_a_label_changes_where_the_potentials_say(first: float, step: float, index: list[list[int]]) -> None:
+    """The second of two points stays associated as long as that is worth more than being an outlier, to a hundredth."""
+    source, target = np.array([[0.0, 1.0], [0.5, 1.0]]), np.array([[0.0, 1.0], [0.5 + step, 1.0], [0.5 + step, 1.0]])
+    index_ = np.array(index)
+    ((to_candidate, to_outlier), (from_outlier, stay)) = edges(source, target, index_)[0]
+    is_inlier = first > -3.0  # the first point, whatever becomes of the second
+    worth = (to_outlier - to_candidate if is_inlier else stay - from_outlier) - 3.0
+    for more, label in ((0.01, index[1][0]), (-0.01, -1)):
+        labels = best_labels(source, target, index_, np.array([[first], [worth + more]]))
+        assert labels.tolist() == [index[0][0] if is_inlier else -1, label]
+
+
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (2, 3), (3, 5), (5, 3), (4, 4)])
 def test_an_association_is_that_chain_in_units_of_spacing(n: int, m: int, closed: bool) -> None:

@@ -81,7 +81,8 @@ def file_name(name: str) -> str:
     """A name as part of a path: never one that leads elsewhere (`..`), nor one that is too long for a file."""
     whole = name.encode(errors="surrogatepass")
     short = name if len(whole) <= LONGEST else f"{name[: LONGEST // 4]}_{hashlib.sha256(whole).hexdigest()[:12]}"
-    return re.sub(r"[^\w.+-]+", "_", short).strip("_.") or "unnamed"
+    safe = re.sub(r"[^\w.+-]+", "_", short).strip("_")
+    return safe if safe.strip(".") else "unnamed"
 
 
 def run_folds(

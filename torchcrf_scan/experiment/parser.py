@@ -11,7 +11,7 @@ from jsonargparse import ArgumentParser, get_loader, set_loader
 
 from torchcrf_scan.experiment.settings import RunConfig
 
-MOST_VALUES = 10_000  # of a YAML file, aliases written out; ours have some fifty
+MOST_VALUES, DEEPEST = 10_000, 50  # of a YAML file; ours have some fifty values, four levels deep
 
 
 def settings_parser(**options: Any) -> ArgumentParser:
@@ -43,23 +43,31 @@ def _bound_yaml() -> Any:
     load = get_loader("yaml")
 
     def load_bounded(text: str) -> Any:
-        try:
-            if "*" in text and _values(yaml.compose(text, yaml.SafeLoader), {}) > MOST_VALUES:
-                raise yaml.YAMLError(f"expected at most {MOST_VALUES} values, aliases written out, got more")
-            return load(text)
-        except RecursionError as error:
-            raise yaml.YAMLError("expected settings a few levels deep, got a text without end") from error
+        check_size(text)
+        return load(text)
 
     set_loader("yaml", load_bounded, (yaml.YAMLError,))
     return load_bounded
 
 
-def _values(node: yaml.Node | None, known: dict[int, int]) -> int:
-    """How many values a text unfolds to from a node on; an alias leads to the node that was counted before."""
-    if node is None or isinstance(node.value, str):
-        return 1
-    if id(node) not in known:
-        known[id(node)] = MOST_VALUES + 1  # until it is counted: a node within itself has no end
-        parts = [part for entry in node.value for part in (entry if isinstance(entry, tuple) else (entry,))]
-        known[id(node)] = 1 + sum(_values(part, known) for part in parts)
-    return known[id(node)]
+def check_size(text: str) -> None:
+    """Raises yaml.YAMLError where a text unfolds to more values, or deeper, than settings need; takes no longer than its length."""
+    sizes: dict[str, int] = {}  # of what an alias may stand for
+    open_: list[tuple[str | None, int]] = [(None, 0)]  # anchors of what is being read, values in it so far
+    for event in yaml.parse(text, yaml.SafeLoader):
+        anchor, count = getattr(event, "anchor", None), 0
+        if isinstance(event, yaml.CollectionStartEvent):
+            open_.append((anchor, 1))
+            if anchor is not None:
+                sizes[anchor] = MOST_VALUES + 1  # until it is read: what holds itself has no end
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, count = open_.pop()
+        elif isinstance(event, yaml.ScalarEvent):
+            count = 1
+        elif isinstance(event, yaml.AliasEvent):
+            anchor, count = None, sizes.get(event.anchor, 1)
+        if count and anchor is not None:
+            sizes[anchor] = count
+        open_[-1] = (open_[-1][0], open_[-1][1] + count)
+        if open_[-1][1] > MOST_VALUES or len(open_) > DEEPEST:
+            raise yaml.YAMLError(f"expected at most {MOST_VALUES} values with aliases written out, {DEEPEST} levels deep, got more")

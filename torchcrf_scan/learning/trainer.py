@@ -42,6 +42,7 @@ from torchcrf_scan.learning.settings import AugmentConfig, Config, DataConfig
 from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction
+from torchcrf_scan.pretrained import find_weights
 from torchcrf_scan.scan import PairPrediction, ScanPair
 from torchcrf_scan.variants.register import ONE_CHAINS
 from torchcrf_scan.whole_file import write_whole
@@ -66,6 +67,8 @@ def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]
 
 def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dict[str, list[PairScore]]:
     """This process's share of `train`."""
+    if config.init:
+        find_weights(config.init)  # before anything is fitted
     folder, resolved = Path(config.output), yaml.safe_dump(asdict(config), sort_keys=False)
     folder.mkdir(parents=True, exist_ok=True)
     train_pairs, test_pairs = load_data(config.data)
