@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops.circle import first_from, polar, rising_bearing, rising_turn
+from torchcrf_scan.features.free_space import WIDEST_GAP
+from torchcrf_scan.loops.circle import first_from, polar, rising_bearing, rising_turn, turn_between
 from torchcrf_scan.loops.jit import Array, kernel
 from torchcrf_scan.loops.median import lower_median
-from torchcrf_scan.search.free_space import measured_ranges, range_slack
+from torchcrf_scan.search.free_space import range_slack
 
 USUAL_STEP = math.radians(0.5)  # of a scan with one point
 
@@ -50,11 +51,23 @@ def beam_after(sweep: Sweep, dx: float, dy: float) -> tuple[float, int]:
 @kernel
 def look(sweep: Sweep, x: float, y: float) -> tuple[float, float]:
     """Free-space test of a point: how far it is seen through and how far hidden, each from 0 (not) to 1 (clearly)."""
-    if len(sweep.ranges) == 0:
+    N = len(sweep.ranges)
+    if N == 0:
         return 0.0, 0.0
     dx, dy = x - sweep.origin[0], y - sweep.origin[1]
     reach = math.sqrt(dx * dx + dy * dy)
-    bearing, after = beam_after(sweep, dx, dy)
-    near, far = measured_ranges(sweep.ranges, sweep.bearings, sweep.step, sweep.is_closed, bearing, after)
+    bearing = rising_bearing(sweep.bearings[0], sweep.step / 2, dx, dy)
+    after = first_from(sweep.bearings, bearing)
+    if sweep.is_closed:
+        left, right = (after - 1) % N, after % N
+    else:
+        if bearing > sweep.bearings[N - 1] + sweep.step / 2:
+            return 0.0, 1.0
+        left, right = max(after - 1, 0), min(after, N - 1)
+    if left != right:
+        beside = max(turn_between(sweep.bearings[left], bearing), turn_between(bearing, sweep.bearings[right]))
+        if not beside < WIDEST_GAP * sweep.step:
+            return 0.0, 0.0
+    near, far = min(sweep.ranges[left], sweep.ranges[right]), max(sweep.ranges[left], sweep.ranges[right])
     slack = range_slack(reach, sweep.step, sweep.noise)
     return min(max((near - reach) / slack - 1, 0.0), 1.0), min(max((reach - far) / slack - 1, 0.0), 1.0)

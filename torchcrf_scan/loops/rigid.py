@@ -86,10 +86,16 @@ def inverse(motion: Array) -> Array:
 @kernel
 def compose(after: Array, before: Array) -> Array:
     """(3,) the motion `before`, then `after`."""
-    both = np.empty(3)
-    both[0] = wrap(after[0] + before[0])
-    both[1], both[2] = transform(transform_of(after), before[1], before[2])
+    both = before.copy()
+    compose_into(both, after)
     return both
+
+
+@kernel
+def compose_into(motion: Array, step: Array) -> None:
+    """Makes a motion (3,) the same motion followed by a step (3,), in place."""
+    x, y = transform(transform_of(step), motion[1], motion[2])
+    motion[0], motion[1], motion[2] = wrap(step[0] + motion[0]), x, y
 
 
 @kernel

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchcrf_scan.inference.motion import LARGEST_TURN, LEAST_DAMPING, SHIFT_DAMPING, TURN_DAMPING
 from torchcrf_scan.loops.jit import Array, Integers, kernel
-from torchcrf_scan.loops.rigid import apply_to_rows, compose, inverse, motion_onto, rotate, transform_of
+from torchcrf_scan.loops.rigid import apply_to_rows, compose_into, inverse, motion_onto, rotate, transform_of
 from torchcrf_scan.loops.solve import solve
 from torchcrf_scan.search.grid import HALF_SPACING, TANGENT_X, TANGENT_Y, UNIT, ScanGrid, X, Y, locate
 
@@ -103,11 +103,12 @@ def register(source: Array, weights: Array, target: ScanGrid, motions: Array, ga
     refined = motions.copy()
     pairs, squared, index = np.empty((PAIR_ROWS, len(source))), np.empty(len(source)), np.empty(len(source), np.int64)
     for h in range(len(motions)):
+        motion = refined[h]
         for i in range(len(gates)):
-            apply_to_rows(refined[h], source, pairs)
+            apply_to_rows(motion, source, pairs)
             locate(pairs, target, squared, index)
             _pair(target, squared, index, weights, gates[i], pairs)
-            refined[h] = compose(gauss_newton_step(pairs, along[i]), refined[h])
+            compose_into(motion, gauss_newton_step(pairs, along[i]))
     return refined
 
 
@@ -144,11 +145,12 @@ def register_both(source: ScanGrid, target: ScanGrid, motions: Array, gates: Arr
     pairs, returned, squared = np.empty((PAIR_ROWS, N + M)), np.empty((2, M)), np.empty(N + M)
     onto, back = np.empty(N, np.int64), np.empty(M, np.int64)
     for h in range(len(motions)):
+        motion = refined[h]
         for i in range(len(gates)):
-            apply_to_rows(refined[h], source.scan.points, pairs)
+            apply_to_rows(motion, source.scan.points, pairs)
             surface_residual(pairs, target, squared[:N], onto)
-            apply_to_rows(inverse(refined[h]), target.scan.points, returned)
+            apply_to_rows(inverse(motion), target.scan.points, returned)
             surface_residual(returned, source, squared[N:], back)
-            _pair_both(source, target, refined[h], squared, onto, back, gates[i], pairs)
-            refined[h] = compose(gauss_newton_step(pairs, along[i]), refined[h])
+            _pair_both(source, target, motion, squared, onto, back, gates[i], pairs)
+            compose_into(motion, gauss_newton_step(pairs, along[i]))
     return refined

@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops.circle import first_from, polar, rising_bearing, rising_turn
+from torchcrf_scan.features.free_space import WIDEST_GAP
+from torchcrf_scan.loops.circle import polar, rising_bearing, rising_turn, turn_apart
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.nearest import Boxes, boxes_of
-from torchcrf_scan.search.free_space import measured_ranges, range_slack
+from torchcrf_scan.search.free_space import range_slack
 
 GRAZING = math.radians(10.0)  # a surface met at a flatter angle looks like a depth jump (adaptive breakpoint detector)
 WIDEST_TURN = GRAZING * (1 - 1e-4)  # between neighbours on a surface; beams are whole steps apart, and just `GRAZING` is too far
@@ -106,13 +107,23 @@ def look_between(scan: Surface, bearing: float, after: int, reach: float) -> int
 
     after: first beam whose bearing is not less.
     """
-    near, far = measured_ranges(scan.ranges, scan.bearings, scan.step, scan.is_closed, bearing, after)
-    slack = range_slack(reach, scan.step, scan.noise)
-    if far == np.inf:
+    M, half = len(scan.ranges), scan.step / 2
+    if not scan.is_closed and bearing > scan.bearings[M - 1] + half:
+        return OCCLUDED
+    left, right = max(after - 1, 0), min(after, M - 1)
+    if scan.is_closed:
+        left, right = (after - 1 if after > 0 else M - 1), (after if after < M else 0)
+    apart = max(turn_apart(bearing - scan.bearings[left]), turn_apart(scan.bearings[right] - bearing))
+    if left == right:
+        apart = min(apart, half)
+    if not apart < WIDEST_GAP * scan.step:
         return UNMEASURED
-    if reach + slack < near:
+    slack = range_slack(reach, scan.step, scan.noise)
+    if reach + slack < min(scan.ranges[left], scan.ranges[right]):
         return SEEN_THROUGH
-    return OCCLUDED if reach > far + slack else AGREES
+    if reach > max(scan.ranges[left], scan.ranges[right]) + slack:
+        return OCCLUDED
+    return AGREES
 
 
 @kernel
@@ -120,4 +131,4 @@ def look_along(scan: Surface, x: float, y: float) -> int:
     """Free-space test of a point (x, y) in the frame of `scan`: one of the four answers above."""
     dx, dy = x - scan.origin[0], y - scan.origin[1]
     bearing = bearing_of(scan, dx, dy)
-    return look_between(scan, bearing, first_from(scan.bearings, bearing), math.sqrt(dx * dx + dy * dy))
+    return look_between(scan, bearing, int(np.searchsorted(scan.bearings, bearing)), math.sqrt(dx * dx + dy * dy))
