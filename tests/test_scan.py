@@ -139,6 +139,6 @@ def test_limits_that_leave_nothing_between_them_are_refused() -> None:
 
 
 def test_beams_that_all_go_one_way_are_refused() -> None:
-    with pytest.raises(ValueError, match="^angle_increment: expected more than 0, got 0$"):
+    with pytest.raises(ValueError, match=r"^angle_increment: expected more than 0, got 0$"):
         Scan.from_ranges([1.0, 2.0], angle_min=0.0, angle_increment=0.0)
     assert len(Scan.from_ranges([1.0], angle_min=0.0, angle_increment=0.0)) == 1

@@ -1,0 +1,1 @@
+"""The rounds of one pair as loops, from a start to the answer, without gradients."""

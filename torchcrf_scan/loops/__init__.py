@@ -1,0 +1,1 @@
+"""Kernels on numbers and arrays that know nothing of features: machine code, angles, motions, nearest points, chains."""
