@@ -14,7 +14,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import WORLDS
-from torchcrf_scan.fast import association, candidates
+from torchcrf_scan.fast import association, candidates, static_features
 from torchcrf_scan.features import potentials
 from torchcrf_scan.features.association import pairwise_features
 from torchcrf_scan.features.free_space import look
@@ -74,9 +74,9 @@ def assert_same_round(batch: ScanPairBatch, parameters: Parameters, count: int =
     view = layer().view(batch)
     source, target = array(view.batch.source[0]), array(view.batch.target[0])
     N, C = len(source), len(MOTIONS)
-    model = association.association_model(parameters)
+    model = static_features.association_model(parameters)
     shapes = shape.describe(source, bool(batch.source_closed[0])), shape.describe(target, bool(batch.target_closed[0]))
-    pair = association.association_pair(source, target, *shapes, array(view.batch.initial_motion[0]))
+    pair = static_features.association_pair(source, target, *shapes, array(view.batch.initial_motion[0]))
     log_cluster = normal(1, N, C + 1, seed=seed)
     work = None
     for motions in (MOTIONS, MOTIONS + 0.01):
@@ -88,7 +88,7 @@ def assert_same_round(batch: ScanPairBatch, parameters: Parameters, count: int =
         sight = look(view.target_sweep, moved)
         seen = array(sight.seen_through[0]), array(sight.hidden[0])
         log_unary, log_pairwise, expected = eager(view, parameters, index, mask, moved)
-        work = work or association.workspace(*index.shape)
+        work = work or static_features.workspace(*index.shape)
         log_association, labels = association.associate(model, pair, work, index, mask, found, *seen, np.zeros(N))
         ours = association.log_unary_of(model, pair, work, found, *seen)
         np.testing.assert_allclose(ours, log_unary, rtol=1e-9, atol=1e-9)
@@ -155,13 +155,13 @@ def test_candidates_that_are_not_real() -> None:
     source, target = array(view.batch.source[0]), array(view.batch.target[0])
     parameters = PARAMETERS["no long edges"]()
     shapes = shape.describe(source, True), shape.describe(target, True)
-    pair = association.association_pair(source, target, *shapes, array(view.batch.initial_motion[0]))
+    pair = static_features.association_pair(source, target, *shapes, array(view.batch.initial_motion[0]))
     index, mask = np.tile(np.arange(4), (12, 1)), np.ones((12, 4), np.bool_)
     mask[3:5, 2:], mask[7] = False, False
     none = np.zeros(12)
     given = index, mask, view.batch.source
-    work = association.workspace(12, 4)
-    model = association.association_model(parameters)
+    work = static_features.workspace(12, 4)
+    model = static_features.association_model(parameters)
     sight = look(view.target_sweep, view.batch.source)
     found, labels = association.associate(
         model, pair, work, index, mask, source, array(sight.seen_through[0]), array(sight.hidden[0]), none
@@ -173,9 +173,11 @@ def test_candidates_that_are_not_real() -> None:
 
 def test_without_candidates_everything_is_an_outlier() -> None:
     source, target = array(make_points(3, 1)), np.empty((0, 2))
-    pair = association.association_pair(source, target, shape.describe(source, False), shape.describe(target, False), np.zeros(3))
+    pair = static_features.association_pair(
+        source, target, shape.describe(source, False), shape.describe(target, False), np.zeros(3)
+    )
     index, mask = np.empty((3, 0), np.int64), np.empty((3, 0), np.bool_)
-    model, work = association.association_model(layer().fitted), association.workspace(3, 0)
+    model, work = static_features.association_model(layer().fitted), static_features.workspace(3, 0)
     log_association, labels = association.associate(model, pair, work, index, mask, source, np.zeros(3), np.ones(3), np.zeros(3))
     assert log_association.tolist() == [[0.0]] * 3
     assert labels.tolist() == [-1] * 3
