@@ -64,11 +64,3 @@ def test_no_points_leave_the_motions() -> None:
     scans = array(make_points(5)), array(make_points(4)), np.zeros((4, 2))
     found = motion.estimate(*scans, nobody, nobody, motions, np.ones(C, np.bool_), motion.LINE, SCALE, MIN_EXTENT)
     np.testing.assert_array_equal(found, motions)
-
-
-def test_small_systems_are_solved() -> None:
-    root = normal(3, 3).numpy()
-    a = root @ root.T + np.eye(3)
-    b = normal(3, seed=1).numpy()
-    found = motion.solve(a[0, 0], a[0, 1], a[0, 2], a[1, 1], a[1, 2], a[2, 2], *b)
-    np.testing.assert_allclose(found, np.linalg.solve(a, b))

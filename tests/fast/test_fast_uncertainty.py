@@ -91,13 +91,3 @@ def test_confidences_agree_with_the_eager_ones() -> None:
     )
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(ours, theirs[0], atol=1e-12)
-
-
-def test_small_matrices_are_inverted_and_taken_apart() -> None:
-    for seed in range(5):
-        root = normal(3, 3, seed=seed).numpy()
-        symmetric = root @ root.T
-        np.testing.assert_allclose(uncertainty.inverse_of(symmetric), np.linalg.inv(symmetric), rtol=1e-8)
-        values, vectors = uncertainty.axes_of(symmetric)
-        np.testing.assert_allclose(values, np.linalg.eigvalsh(symmetric), atol=1e-12)
-        np.testing.assert_allclose(vectors.T @ np.diag(values) @ vectors, symmetric, atol=1e-12)
