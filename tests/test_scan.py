@@ -1,6 +1,5 @@
-from dataclasses import FrozenInstanceError
-
 import re
+from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
