@@ -6,7 +6,8 @@ A kernel calls kernels. An entry is a kernel that other code calls as well: only
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -23,6 +24,9 @@ Booleans = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 
+Watch = Callable[["Entry", tuple[Any, ...]], None]  # is told of a call
+
+
 class Entry:
     """A kernel as other code calls it, with positional arguments.
 
@@ -31,10 +35,10 @@ class Entry:
 
     Attributes:
         name: module and function, without the package's name. python: the function itself.
-        watch: is called with the arguments of every call that plain Python answers.
+        watch: see `in_python`.
     """
 
-    watch: Callable[[Entry, tuple[Any, ...]], None] | None = None
+    watch: Watch | None = None
 
     def __init__(self, python: Callable[..., Any]) -> None:
         self.python = python
@@ -45,11 +49,13 @@ class Entry:
         self._has_warned = False
 
     def __call__(self, *arguments: Any) -> Any:
-        code = self._code or self._find()
-        if code is not None and self._takes(arguments):
-            return code(*arguments)
+        """The function's value, by machine code where there is some."""
         if self.watch is not None:
             self.watch(self, arguments)
+        else:
+            code = self._code or self._find()
+            if code is not None and self._takes(arguments):
+                return code(*arguments)
         with np.errstate(all="ignore"):  # as machine code, which never warns
             return self.python(*arguments)
 
@@ -72,6 +78,16 @@ class Entry:
             self._has_warned = True
             log.warning("%s: arguments that its machine code is not made for, answered by slow loops", self.name)
         return False
+
+
+@contextmanager
+def in_python(watch: Watch = lambda entry, arguments: None) -> Iterator[None]:
+    """Every entry answers by plain Python meanwhile, and `watch` is told of every call."""
+    before, Entry.watch = Entry.watch, staticmethod(watch)
+    try:
+        yield
+    finally:
+        Entry.watch = before
 
 
 KERNELS: list[Callable[..., Any]] = []

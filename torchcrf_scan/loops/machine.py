@@ -30,11 +30,13 @@ PACKAGE = Path(__file__).parents[1]
 NAME = "machine"  # of every extension module: of one name, they share what pycc links to each
 PARTS: dict[str, tuple[str, ...]] = {  # the modules whose entries each extension holds
     "pool": ("search/pool.py", "search/background.py", "search/cold.py"),
-    "survey": ("search/survey.py", "search/surface.py", "search/grid.py", "search/leftover.py", "search/hypotheses.py"),
-    "features": ("search/hypothesis_features.py", "search/accept.py", "search/choose.py", "loops/shape.py"),
+    "survey": ("search/surface.py", "search/grid.py", "search/leftover.py", "search/hypotheses.py", "loops/shape.py"),
+    "choice": ("search/hypothesis_features.py", "search/accept.py", "search/choose.py"),
     "rounds": ("fast/decode.py", "fast/candidates.py"),
     "answer": ("fast/uncertainty.py", "encoder/aligned_loops.py"),
 }
+COMPILER = ("prepare/extension.py", "prepare/record.py")  # its flags, and the types that it is given
+CALLER = ("loops/jit.py", "loops/machine.py")  # what calls machine code is not compiled into it
 IMPORT = re.compile(rb"^\s*from torchcrf_scan\.([\w.]+) import", re.MULTILINE)
 SECONDS_BETWEEN_LOOKS = 1.0
 
@@ -88,8 +90,8 @@ def stem(part: str, level: str) -> str:
 
 def digest_of(modules: Iterable[str]) -> str:
     """Of some modules and all of the package that they import: their constants are in the machine code."""
-    waiting, seen = list(modules), set[str]()
-    digest = hashlib.sha256()
+    waiting, seen = list(modules), set(CALLER)
+    digest = hashlib.sha256(b"".join((PACKAGE / name).read_bytes() for name in COMPILER))
     while waiting:
         name = waiting.pop()
         if name not in seen and (PACKAGE / name).is_file():
@@ -147,7 +149,8 @@ def symbol(name: str) -> str:
 def _import(path: Path, part: str) -> ModuleType:
     name = f"{__name__}.{part}.{NAME}"
     spec = spec_from_file_location(name, path, loader=ExtensionFileLoader(name, str(path)))
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -1,6 +1,6 @@
 """Builds the machine code that is missing: one extension module a part, by as many processes as there are cores.
 
-    layouts of example pairs -> an object file a part, at once -> linked, written beside, renamed -> used by whoever looks for it
+layouts of example pairs -> an object file a part, at once -> linked, written beside, renamed -> used by whoever looks for it
 """
 
 from __future__ import annotations

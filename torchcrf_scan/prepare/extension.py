@@ -10,7 +10,9 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from multiprocessing import parent_process
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 from torchcrf_scan.loops import jit, machine
@@ -20,7 +22,15 @@ SAFE_MATH = {"reassoc", "contract", "nsz", "arcp"}  # not those that assume fini
 
 
 def choose_processor(level: str) -> None:
-    """Of the code that this process makes; before numba is imported, which reads it then."""
+    """Of the code that this process makes; before numba is imported, which reads it then. Ends this process with its parent."""
+
+    def follow() -> None:
+        parent = parent_process()
+        assert parent is not None
+        parent.join()
+        os._exit(1)
+
+    Thread(target=follow, daemon=True).start()
     assert "numba" not in sys.modules
     os.environ |= {"NUMBA_CPU_NAME": level, "NUMBA_CPU_FEATURES": "", "NUMBA_DISABLE_JIT": "0"}
 
@@ -94,6 +104,8 @@ def _compile_as_the_loops_need() -> None:
     compiler.Flags = flags
     # What kernels are called by is never called in this process, but must differ from one to another.
     cpu.CPUContext.get_executable = lambda self, library, description, environment: [].append
+    # Entries are optimised with all that is linked into them: to optimise kernels before is a fifth of the time and changes little.
+    codegen.JITCodeLibrary._optimize_final_module = lambda self: None
     codegen.JITCodeLibrary._finalize_specific = lambda self: None
     codegen.JITCPUCodegen._add_module = lambda self, module: None
     for name in (part for parts in machine.PARTS.values() for part in parts):
