@@ -19,6 +19,7 @@ from torchcrf_scan.commands.experiment import experiment, experiment_parser
 from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.commands.match import match
 from torchcrf_scan.commands.plot import plot
+from torchcrf_scan.commands.prepare import prepare
 from torchcrf_scan.commands.simulate import simulate
 from torchcrf_scan.data.formats import ENDINGS
 
@@ -29,6 +30,7 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
     "experiment": experiment,
     "plot": plot,
     "bench": bench,
+    "prepare": prepare,
 }
 
 POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: what is given, how many (one where None), meaning

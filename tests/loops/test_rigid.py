@@ -27,3 +27,23 @@ def test_they_are_those_of_arrays(theta: float, seed: int) -> None:
 @pytest.mark.parametrize(("angle", "wrapped"), [(0.0, 0.0), (math.pi, math.pi), (-math.pi, math.pi), (4.0, 4.0 - math.tau)])
 def test_wrap(angle: float, wrapped: float) -> None:
     assert rigid.wrap(angle) == pytest.approx(wrapped)
+
+
+def test_a_motion_of_given_rotation_takes_a_point_onto_another() -> None:
+    motion = rigid.motion_onto(0.7, 1.0, -2.0, 3.0, 0.5)
+    assert motion[0] == 0.7
+    np.testing.assert_allclose(rigid.apply(motion, np.array([[1.0, -2.0]])), [[3.0, 0.5]], atol=1e-12)
+
+
+def test_rows_and_steps_in_place_agree_with_apply_and_compose() -> None:
+    points, motion, step = np.array([[1.0, 2.0], [-0.5, 3.0], [4.0, 0.0]]), np.array([0.4, 1.0, -2.0]), np.array([3.0, 0.2, 0.1])
+    rows = np.empty((2, 3))
+    rigid.apply_to_rows(motion, points, rows)
+    np.testing.assert_allclose(rows.T, rigid.apply(motion, points), atol=1e-12)
+    both = rigid.compose(step, motion)
+    parting = rigid.parting(rigid.transform_of(both), rigid.transform_of(motion), 1.0, 2.0)
+    moved = rigid.apply(step, rigid.apply(motion, points))
+    np.testing.assert_allclose(rigid.apply(both, points), moved, atol=1e-12)
+    np.testing.assert_allclose(parting, np.hypot(*(moved[0] - rows[:, 0])), atol=1e-12)
+    rigid.compose_into(motion, step)
+    np.testing.assert_allclose(motion, both, atol=1e-12)

@@ -1,4 +1,6 @@
-"""Small systems and matrices, against those of numpy."""
+"""Linear algebra of 3x3 matrices, against numpy's."""
+
+from __future__ import annotations
 
 import numpy as np
 from support import normal

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcrf_scan.encoder.channels import BESIDE, CHANNELS, FARTHEST, LARGEST_TURN, LONGEST_CHORD, NEAR, NOWHERE, PROFILE, WINDOW
 from torchcrf_scan.fast.free_space import Sweep, beam_after, look, sweep_of
 from torchcrf_scan.loops.circle import turn_between
-from torchcrf_scan.loops.jit import Array, Booleans, kernel
+from torchcrf_scan.loops.jit import Array, Booleans, entry, kernel
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.pair import Pair, PairStart, padded
 from torchcrf_scan.loops.rigid import inverse, transform, transform_of
@@ -136,7 +136,7 @@ def channels_of(
     return channels
 
 
-@kernel
+@entry
 def channels_of_side(pair: Pair, motions: Array, log_odds: Array, reach: Booleans, is_target: bool) -> Array:
     """(N, F) of the source, or (M, F) of the target. motions: (C, 3); log_odds: (C,); reach: (N, C)."""
     source = sweep_of(pair.source, pair.noise, pair.source_closed, np.zeros(2))

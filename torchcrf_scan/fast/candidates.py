@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
 from torchcrf_scan.loops.nearest import RUN, Boxes, box_distance, nearest
 from torchcrf_scan.loops.rigid import apply
 
@@ -103,7 +103,7 @@ def nearest_under(boxes: Boxes, moved: Array, which: Integers, C: int) -> Intege
     return index
 
 
-@kernel
+@entry
 def by_motion(boxes: Boxes, source: Array, motions: Array, active: Booleans, count: int) -> tuple[Integers, Booleans, Integers]:
     """The `count` target points that come nearest under any active motion; all of them when count is 0 (dense).
 
@@ -139,7 +139,7 @@ def by_motion(boxes: Boxes, source: Array, motions: Array, active: Booleans, cou
     return index, mask, closest
 
 
-@kernel
+@entry
 def with_targets(index: Integers, mask: Booleans, association: Integers) -> tuple[Integers, Booleans, Integers]:
     """Adds a given target to every point's candidates, in place of the last, and finds it there.
 

@@ -20,7 +20,7 @@ from torchcrf_scan.fast.static_features import association_pair, workspace
 from torchcrf_scan.fast.uncertainty import association_confidence, cluster_confidence, motion_covariance
 from torchcrf_scan.features.potentials import REFERENCE_UNIT
 from torchcrf_scan.inference.joint import MERGE_ROTATION, ROBUST_SHARE, SELECTION_ROUNDS
-from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.nearest import boxes_of
 from torchcrf_scan.loops.pair import Pair, PairStart
 from torchcrf_scan.loops.rigid import parting, transform_of, wrap
@@ -46,7 +46,7 @@ def scaled_motions(motions: Array, factor: float) -> Array:
     return scaled
 
 
-@kernel
+@entry
 def scene_of(pair: Pair, start: PairStart, outlier: Array, moving: Array, settings: Settings) -> Scene:
     """The pair in the unit of the features, with its descriptors. outlier, moving: (N,) as in `Scene`."""
     factor = 1.0 if settings.is_metre else REFERENCE_UNIT / resolution(pair.source, pair.target, pair.noise)
@@ -64,7 +64,7 @@ def scene_of(pair: Pair, start: PairStart, outlier: Array, moving: Array, settin
     return Scene(factor, source, target, noise, boxes, source_sweep, target_sweep, descriptors, *given)
 
 
-@kernel
+@entry
 def certain(labels: Integers, states: int) -> Array:
     """(N, S) log-beliefs that put all belief on labels (N,)."""
     log_beliefs = np.empty((len(labels), states))
@@ -74,7 +74,7 @@ def certain(labels: Integers, states: int) -> Array:
     return log_beliefs
 
 
-@kernel
+@entry
 def first_state(scene: Scene, start: PairStart, is_chosen: bool, settings: Settings) -> State:
     """The start as a state, all considered movers in it unless they are chosen; `cluster` and beliefs are not filled in yet."""
     N, C = len(scene.source), len(start.motions)
@@ -135,7 +135,7 @@ def join(state: State, low: int, high: int) -> None:
     state.active[high] = False
 
 
-@kernel
+@entry
 def merge_alike(source: Array, state: State, scale: float) -> None:
     """Clusters that turn out to be one become the one with the lower number, in place; `inference.joint.merge_alike`."""
     C = len(state.motions)
@@ -155,7 +155,7 @@ def merge_alike(source: Array, state: State, scale: float) -> None:
                     join(state, low, high)
 
 
-@kernel
+@entry
 def iterate(
     scene: Scene, state: State, start: PairStart, is_chosen: bool, fitted: Fitted, settings: Settings
 ) -> tuple[State, bool, int]:
@@ -182,7 +182,7 @@ def iterate(
     return state, converged, iterations
 
 
-@kernel
+@entry
 def read_out(scene: Scene, state: State, converged: bool, iterations: int, fitted: Fitted, settings: Settings) -> Decoded:
     """The answer in metres, with covariances and confidences."""
     covariance, information, directions = motion_covariance(

@@ -10,7 +10,7 @@ import numpy as np
 from torchcrf_scan.fast.motion import POINT, Members, members_of, places_of
 from torchcrf_scan.fast.robust import robust_weight
 from torchcrf_scan.inference.uncertainty import MOST_CERTAIN, NEIGHBOURS, NOTHING, RUN, STEPS, STRETCH, TINY, WITHIN
-from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
 from torchcrf_scan.loops.rigid import rotate, transform, transform_of
 from torchcrf_scan.loops.solve import axes_of, inverse_of, product
 from torchcrf_scan.prediction import LEAST_SHARE
@@ -254,7 +254,7 @@ def about_origin(local: Array, length: float, x: float, y: float) -> Array:
     return covariance
 
 
-@kernel
+@entry
 def motion_covariance(
     source: Array,
     target: Array,
@@ -299,7 +299,7 @@ def confidence(yes: float, no: float, calibration: Array) -> float:
     return 1 / (1 + math.exp(-(calibration[0] * (math.log(yes) - math.log(no)) + calibration[1])))
 
 
-@kernel
+@entry
 def association_confidence(log_association: Array, candidates: Integers, association: Integers, calibration: Array) -> Array:
     """(N,) calibrated probability that an association is right within `WITHIN` target points.
 
@@ -319,7 +319,7 @@ def association_confidence(log_association: Array, candidates: Integers, associa
     return sure
 
 
-@kernel
+@entry
 def cluster_confidence(log_cluster: Array, cluster: Integers, calibration: Array) -> Array:
     """(N,) calibrated probability of the chosen cluster. log_cluster: (N, D). cluster: (N,), -1 outlier. calibration: (2,)."""
     N, D = log_cluster.shape

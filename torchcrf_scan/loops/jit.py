@@ -1,80 +1,107 @@
-"""How the loops of this package are compiled, and where the machine code is kept."""
+"""Loops over numbers and arrays: machine code where it has been built (`torchcrf_scan.loops.machine`), plain Python elsewhere.
+
+A kernel calls kernels. An entry is a kernel that other code calls as well: only there does an answer cross into machine code.
+"""
 
 from __future__ import annotations
 
-import hashlib
 import logging
-import os
-import shutil
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
-from numba.core import event
 from numpy.typing import NDArray
+
+from torchcrf_scan.loops import machine
+from torchcrf_scan.loops.layout import fits
 
 F = TypeVar("F", bound=Callable[..., Any])
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 
-SAFE_MATH = {"reassoc", "contract", "nsz", "arcp"}  # not those that assume finite numbers: impossible states are -inf
-PACKAGE = Path(__file__).parents[1]
-SOURCES = ("loops/*.py", "search/*.py", "fast/*.py", "encoder/*.py", "features/*.py", "inference/*.py", "names.py")  # compiled in
-
 log = logging.getLogger(__name__)
 
 
-def cache_folder() -> str | None:
-    """Where machine code is kept; None where nothing can be written, and every process compiles anew.
+Watch = Callable[["Entry", tuple[Any, ...]], None]  # is told of a call
 
-    A folder for each state of the sources, for numba itself knows when a function has changed, but not what it calls. It lies
-    beside the modules, or in the user's cache; `NUMBA_CACHE_DIR` overrules both.
+
+class Entry:
+    """A kernel as other code calls it, with positional arguments.
+
+    Machine code trusts the types and layout of what it is given. Other arguments than those it was built for are answered by the
+    same loops in plain Python, and a warning names the entry once.
+
+    Attributes:
+        name: module and function, without the package's name. python: the function itself.
+        watch: see `in_python`.
     """
-    if numba.config.CACHE_DIR:  # type: ignore[attr-defined]
-        return str(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
-    digest = hashlib.sha256()
-    for path in sorted(path for source in SOURCES for path in PACKAGE.glob(source)):
-        digest.update(path.read_bytes())
-    for parent in (PACKAGE / "loops" / "__pycache__", Path("~/.cache/torchcrf_scan").expanduser()):
-        folder = parent / f"numba-{digest.hexdigest()[:16]}"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(folder, os.W_OK):
-            for old in parent.glob("numba-*"):
-                if old != folder:
-                    shutil.rmtree(old, ignore_errors=True)
-            return str(folder)
-    return None
+
+    watch: Watch | None = None
+
+    def __init__(self, python: Callable[..., Any]) -> None:
+        self.python = python
+        self.name = f"{python.__module__.partition('.')[2]}.{python.__name__}"
+        self.__name__, self.__doc__, self.__module__ = python.__name__, python.__doc__, python.__module__
+        self._code: Callable[..., Any] | None = None
+        self._checks: tuple[Callable[[Any], bool], ...] = ()
+        self._has_warned = False
+
+    def __call__(self, *arguments: Any) -> Any:
+        """The function's value, by machine code where there is some."""
+        if self.watch is not None:
+            self.watch(self, arguments)
+        else:
+            code = self._code or self._find()
+            if code is not None and self._takes(arguments):
+                return code(*arguments)
+        with np.errstate(all="ignore"):  # as machine code, which never warns
+            return self.python(*arguments)
+
+    def _find(self) -> Callable[..., Any] | None:
+        """The machine code, once there is some."""
+        found = machine.find(self.name)
+        if found is not None:
+            self._checks = tuple(fits(layout) for layout in found.layouts)
+            self._code = found.code
+        return self._code
+
+    def _takes(self, arguments: tuple[Any, ...]) -> bool:
+        if len(arguments) == len(self._checks):
+            for check, argument in zip(self._checks, arguments, strict=True):
+                if not check(argument):
+                    break
+            else:
+                return True
+        if not self._has_warned:
+            self._has_warned = True
+            log.warning("%s: arguments that its machine code is not made for, answered by slow loops", self.name)
+        return False
 
 
-CACHE = cache_folder()
+@contextmanager
+def in_python(watch: Watch = lambda entry, arguments: None) -> Iterator[None]:
+    """Every entry answers by plain Python meanwhile, and `watch` is told of every call."""
+    before, Entry.watch = Entry.watch, staticmethod(watch)
+    try:
+        yield
+    finally:
+        Entry.watch = before
+
+
+KERNELS: list[Callable[..., Any]] = []
+ENTRIES: dict[str, Entry] = {}
 
 
 def kernel(function: F) -> F:
-    """Compiles a function of numbers and arrays when it is first called, keeps the code on disk and lets other threads run."""
-    before = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-    numba.config.CACHE_DIR = CACHE or before  # type: ignore[attr-defined]
-    try:
-        options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": SAFE_MATH}
-        return cast(F, numba.njit(cache=CACHE is not None, **options)(function))
-    finally:
-        numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
+    """A function of numbers and arrays that is compiled into the machine code of those that call it."""
+    KERNELS.append(function)
+    return function
 
 
-class _Patience(event.Listener):
-    """Says once why the first pair ever takes so long."""
-
-    def on_start(self, event: event.Event) -> None:
-        log.warning("compiling the loops for this machine, once: this takes a minute or two")
-        numba.core.event.unregister("numba:compile", self)
-
-    def on_end(self, event: event.Event) -> None:
-        pass
-
-
-event.register("numba:compile", _Patience())
+def entry(function: F) -> F:
+    """A kernel that is called from elsewhere too."""
+    made = Entry(kernel(function))
+    ENTRIES[made.name] = made
+    return cast(F, made)

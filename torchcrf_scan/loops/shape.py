@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops.jit import Array, kernel
+from torchcrf_scan.loops.jit import Array, entry, kernel
 from torchcrf_scan.loops.median import lower_median
 
 ORDERS = (1, 3, 5)  # "first, third or fifth neighbour"
@@ -100,7 +100,7 @@ def _open_spacing(points: Array, into: Array) -> None:
         before = after
 
 
-@kernel
+@entry
 def resolution(source_points: Array, target_points: Array, noise: float) -> float:
     """Metres: half the usual spacing of a pair's points and twice their noise (`features.potentials.resolution`)."""
     N = len(source_points)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -21,6 +22,10 @@ R = TypeVar("R")
 def _helpers(count: int) -> ThreadPoolExecutor:
     """Worker threads beside the caller's own; kept, because starting one takes longer than many a stage."""
     return ThreadPoolExecutor(count, thread_name_prefix="torchcrf_scan")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_helpers.cache_clear)  # the parent's threads do not exist there
 
 
 def for_each(function: Callable[[T], R], items: Sequence[T]) -> list[R]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.nearest import RUN, Boxes
 from torchcrf_scan.loops.rigid import apply_to_some
 from torchcrf_scan.search.grid import ScanGrid
@@ -50,7 +50,7 @@ def score_of(module: HypothesisScore) -> Score:
     return Score(mean, scale, weight, float(module.bias), float(module.threshold))
 
 
-@kernel
+@entry
 def probabilities_of(score: Score, features: Array) -> Array:
     """(H,) probabilities that a hypothesis is a mover's motion. features: (H, F)."""
     F = len(score.mean)
@@ -75,7 +75,7 @@ class _Accepted(NamedTuple):
     explained: Integers
 
 
-@kernel
+@entry
 def select(leftover: Leftover, hypotheses: Hypotheses, probabilities: Array, threshold: float, most: int) -> Integers:
     """(G,) numbers of the accepted hypotheses, greedily: the most probable first, its rivals are dropped, and so on.
 

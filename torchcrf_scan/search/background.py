@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.rigid import apply_to_rows, inverse, parting, transform_of
 from torchcrf_scan.search.grid import COST_SHARE, ScanGrid, share_of
@@ -22,7 +22,7 @@ POLISH_GATES, POLISH_ALONG = np.array((4.0, 3.0, 2.0, 1.5)), np.array((0.1,) * 4
 REFINE_GATES, REFINE_ALONG = np.array((3.0, 2.0, 2.0, 1.5, 1.5, 1.5)), np.array((0.03,) * 6)
 
 
-@kernel
+@entry
 def unit_length(source: Surface, target: Surface) -> float:
     """Metres: the size of an ordinary registration error, from spacing and noise alone. All gates are multiples of it."""
     return lower_median(np.concatenate((source.spacing, target.spacing))) / 2 + 2 * max(source.noise, target.noise)
@@ -91,7 +91,7 @@ def _some_of(grid: ScanGrid, stride: int) -> tuple[Array, Array]:
     return every(grid.scan.points, stride), share_of(every(grid.scan.length, stride), COST_SHARE[0], COST_SHARE[1])
 
 
-@kernel
+@entry
 def background_cost(motions: Array, source: ScanGrid, target: ScanGrid, most: int, slack: float) -> Array:
     """(H,) truncated residual of the whole scene under every motion, both ways (design finding 17).
 
@@ -117,13 +117,13 @@ def cost_of(motion: Array, source: ScanGrid, target: ScanGrid) -> float:
     return float(background_cost(motion.reshape(1, 3), source, target, 0, 1.0)[0])
 
 
-@kernel
+@entry
 def polish(motions: Array, source: ScanGrid, target: ScanGrid, unit: float) -> Array:
     """(H, 3) motions registered with wide gates, from starts (H, 3) that are a few gates off, near enough for `refine`."""
     return register(source.scan.points, source.pull, target, motions, unit * POLISH_GATES, POLISH_ALONG)
 
 
-@kernel
+@entry
 def refine(motions: Array, source: ScanGrid, target: ScanGrid) -> Array:
     """(H, 3) motions registered point-to-line by all points both ways, from good starts, by the residual of `background_cost`."""
     return register_both(source, target, motions, REFINE_GATES, REFINE_ALONG)
@@ -138,7 +138,7 @@ def _median_gap(points: Array, one: Array, other: Array) -> float:
     return lower_median(gap)
 
 
-@kernel
+@entry
 def follow(guess: Array, source: ScanGrid, target: ScanGrid) -> tuple[bool, Array]:
     """Whether refining a guess (3,) leads to the background, and the refined motion (3,)."""
     unit = unit_length(source.scan, target.scan)

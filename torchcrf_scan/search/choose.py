@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from torchcrf_scan.inference.start import ASSOCIATION_GATE, FOOTPRINT, REACH_EXTENT, REACH_UNITS
-from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
 from torchcrf_scan.loops.nearest import box_distance
 from torchcrf_scan.loops.pair import PairStart
 from torchcrf_scan.loops.rigid import apply_to_rows
@@ -21,7 +21,7 @@ FEWEST_POINTS = 3  # a scan with fewer does not determine a motion
 CERTAIN = 1e-6  # probabilities are kept this far from 0 and 1
 
 
-@kernel
+@entry
 def choose_movers(
     leftover: Leftover, guess: Array, hypotheses: Hypotheses, features: Array, score: Score, clusters: int, resolution: float
 ) -> PairStart:

@@ -14,7 +14,7 @@ import torch
 
 from torchcrf_scan.features.potentials import REFERENCE_UNIT
 from torchcrf_scan.features.scales import KAPPA, Scales
-from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.kabsch import kabsch
 from torchcrf_scan.loops.rigid import transform, transform_of
 from torchcrf_scan.loops.shape import Shape, describe, resolution
@@ -191,7 +191,7 @@ def best_labels(source: Array, target: Array, index: Integers, score: Array) -> 
     return labels
 
 
-@kernel
+@entry
 def shape_association(source: Array, target: Array, noise: float, source_closed: bool, target_closed: bool) -> Integers:
     """(N,) associations, -1 outlier, of a chain on shapes and distances along the scan, without positions.
 
@@ -211,7 +211,7 @@ def shape_association(source: Array, target: Array, noise: float, source_closed:
 # RANSAC.
 
 
-@kernel
+@entry
 def sampled_motions(source: Array, target: Array, gate: float, picks: Integers) -> tuple[Array, Integers]:
     """(H, 3) motions of pairs of associations (H, 2), and (H,) number of the associations that each agrees with.
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.nearest import RUN, Boxes, nearest
 from torchcrf_scan.search.surface import Surface
@@ -148,7 +148,7 @@ def _lay_out(scan: Surface) -> tuple[Array, float, int, int]:
     return low, 1 / size, columns, rows
 
 
-@kernel
+@entry
 def grid_of(scan: Surface) -> ScanGrid:
     """The grid of a scan; takes some tenths of a millisecond."""
     points, P = scan.points, len(scan.points)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
 from torchcrf_scan.loops.nearest import Boxes, nearest_within
 from torchcrf_scan.loops.rigid import apply, compose, motion_onto, wrap
 from torchcrf_scan.search.grid import ScanGrid
@@ -41,7 +41,7 @@ class Hypotheses(NamedTuple):
     groups: Groups
 
 
-@kernel
+@entry
 def members_of(hypotheses: Hypotheses, which: Integers, count: int) -> Booleans:
     """(G, P) bool: the points that the hypotheses `which` (G,) move, of a scan of P = `count`."""
     start, index = hypotheses.groups
@@ -53,7 +53,7 @@ def members_of(hypotheses: Hypotheses, which: Integers, count: int) -> Booleans:
     return members
 
 
-@kernel
+@entry
 def hypothesise(leftover: Leftover, dt: float) -> Hypotheses:
     """Hypotheses that align every group with unexplained points with every such group of the other scan.
 

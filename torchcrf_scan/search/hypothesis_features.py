@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.rigid import rotate_back, transform_of, wrap
 from torchcrf_scan.search.feature_points import (
@@ -39,7 +39,7 @@ USUAL_UNITS, USUAL_COUNT = (
 )  # units in all, and of how many points, that are added to those around, a prior against few points
 
 
-@kernel
+@entry
 def hypothesis_features(leftover: Leftover, hypotheses: Hypotheses) -> Array:
     """(H, F) features of the hypotheses, in the order of `FEATURES`: shares, logarithms and local units only."""
     (start, index), motions, group = hypotheses.groups, hypotheses.motions, hypotheses.group

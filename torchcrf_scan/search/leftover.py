@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
 from torchcrf_scan.loops.rigid import apply, apply_to_rows, inverse
 from torchcrf_scan.search.background import unit_length
 from torchcrf_scan.search.grid import HALF_SPACING, ScanGrid, locate
@@ -51,7 +51,7 @@ class Leftover(NamedTuple):
     unit: float
 
 
-@kernel
+@entry
 def leftover_of(source: ScanGrid, target: ScanGrid, background: Array) -> Leftover:
     """The leftover of a background motion (3,)."""
     forward = apply(background, source.scan.points)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Integers, entry
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.rigid import compose, wrap
 from torchcrf_scan.search.background import background_cost, every, polish, refine, stride_of, unit_length
@@ -52,7 +52,7 @@ def alone(stage: Stage, motions: Array) -> Array:
 # The stages.
 
 
-@kernel
+@entry
 def _reach_of(source: Surface, target: Surface) -> float:
     return lower_median(np.concatenate((source.ranges, target.ranges)))
 
@@ -65,7 +65,7 @@ def start_grid(source: Surface, target: Surface) -> Array:
     return grid.astype(np.float64)
 
 
-@kernel
+@entry
 def shifted_from(grid: Array, guesses: Array) -> Array:
     """(G H, 3) the motions (H, 3) of a grid, each after every guess (G, 3)."""
     starts = np.empty((len(guesses) * len(grid), 3))
@@ -75,7 +75,7 @@ def shifted_from(grid: Array, guesses: Array) -> Array:
     return starts
 
 
-@kernel
+@entry
 def search_coarsely(motions: Array, source: ScanGrid, target: ScanGrid, unit: float) -> Array:
     """(H, 3) motions of some of the source's points, registered with wide gates."""
     stride = stride_of(len(source.features), COARSE_POINTS)
@@ -83,7 +83,7 @@ def search_coarsely(motions: Array, source: ScanGrid, target: ScanGrid, unit: fl
     return register(points, every(source.pull, stride), target, motions, unit * COARSE_GATES, COARSE_ALONG)
 
 
-@kernel
+@entry
 def slide(motions: Array, target: Surface, unit: float) -> Array:
     """(H S, 3) motions displaced along the way that most of the target's surface runs: there, registration is slow or blind."""
     sine = cosine = 0.0
@@ -111,7 +111,7 @@ def large_segments(source: Surface) -> Integers:
     return largest[sizes[largest] >= SMALLEST_SEGMENT].numpy()
 
 
-@kernel
+@entry
 def segment_points(source: Surface, chosen: Integers) -> Array:
     """(S, 24, 2) points of segments (S,), evenly drawn."""
     points = np.empty((len(chosen), SEGMENT_POINTS, 2))
@@ -128,7 +128,7 @@ def segment_points(source: Surface, chosen: Integers) -> Array:
     return points
 
 
-@kernel
+@entry
 def segment_hypotheses(segments: Array, target: ScanGrid, motions: Array, unit: float) -> Array:
     """(S H, 3) registers every segment (S, L, 2) alone: where most returns belong to a mover, some segment still is background."""
     H = len(motions)
@@ -139,7 +139,7 @@ def segment_hypotheses(segments: Array, target: ScanGrid, motions: Array, unit: 
     return found
 
 
-@kernel
+@entry
 def distinct(motions: Array, cost: Array, near: float, count: int) -> Integers:
     """Index of the `count` cheapest motions of which no two are closer than `near` (metres) and alike in their turn."""
     is_left = np.ones(len(motions), np.bool_)

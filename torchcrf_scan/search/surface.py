@@ -9,7 +9,7 @@ import numpy as np
 
 from torchcrf_scan.features.free_space import WIDEST_GAP
 from torchcrf_scan.loops.circle import polar, rising_bearing, rising_turn, turn_apart
-from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.nearest import Boxes, boxes_of
 from torchcrf_scan.search.free_space import range_slack
@@ -58,7 +58,7 @@ def number_runs(joined: Booleans) -> Integers:
     return number
 
 
-@kernel
+@entry
 def surface_of(points: Array, noise: float, is_closed: bool, origin: Array) -> Surface:
     """The surface of (P, 2) points in beam order, P >= 1. noise: metres; origin: (2,) of the sensor."""
     P = len(points)

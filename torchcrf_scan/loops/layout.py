@@ -1,0 +1,82 @@
+"""The layout of an entry's arguments: what its machine code is built for, and what it must be given.
+
+A layout is `float`, `int` or `bool`; `float64:2` for an array of two dimensions, in C order, aligned and writeable; or a list for a
+tuple: its class as `module:name` (empty for a plain one), then the layouts of its items.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any, get_type_hints
+
+import numpy as np
+
+Layout = str | list[Any]
+
+NUMBERS = {"float": (float, int, np.floating, np.integer), "int": (int, np.integer), "bool": (bool, np.bool_)}
+IN_ORDER = 0x0001 | 0x0100 | 0x0400  # numpy's flags of an array in C order, aligned and writeable
+
+
+def layout_of(value: Any, hint: Any = None) -> Layout:
+    """The layout of an example. hint: its annotation, which decides whether a number may have a fraction."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}:{value.ndim}"
+    if isinstance(value, tuple):
+        kind = type(value)
+        name = "" if kind is tuple else f"{kind.__module__}:{kind.__qualname__}"
+        hints = list(get_type_hints(kind).values()) if name else [None] * len(value)
+        return [name, *(layout_of(item, item_hint) for item, item_hint in zip(value, hints, strict=True))]
+    if hint is float or isinstance(value, (float, np.floating)):
+        return "float"
+    for name in ("bool", "int"):
+        if isinstance(value, NUMBERS[name]):
+            return name
+    raise TypeError(f"argument of an entry: expected numbers, arrays and tuples of them, got {type(value).__name__}")
+
+
+def layouts_of(function: Callable[..., Any], arguments: Sequence[Any]) -> list[Layout]:
+    """The layouts of a call's arguments."""
+    hints = get_type_hints(function)
+    names = function.__code__.co_varnames[: len(arguments)]
+    return [layout_of(argument, hints.get(name)) for name, argument in zip(names, arguments, strict=True)]
+
+
+def class_of(name: str) -> type:
+    """The class of a tuple in a layout."""
+    module, _, kind = name.partition(":")
+    return getattr(import_module(module), kind) if name else tuple
+
+
+def fits(layout: Layout) -> Callable[[Any], bool]:
+    """Whether a value has a layout. It is asked for every argument of every call, so it looks at no more than it must."""
+    if isinstance(layout, list):
+        return _fits_tuple(class_of(layout[0]), [fits(item) for item in layout[1:]])
+    name, _, dimensions = layout.partition(":")
+    if dimensions:
+        return _fits_array(np.dtype(name), int(dimensions))
+    kinds = NUMBERS[name]
+    return lambda value: isinstance(value, kinds)
+
+
+def _fits_tuple(kind: type, checks: Sequence[Callable[[Any], bool]]) -> Callable[[Any], bool]:
+    def check(value: Any) -> bool:
+        if type(value) is not kind:
+            return False
+        for fits_item, item in zip(checks, value, strict=True):  # noqa: SIM110 (a generator takes twice as long)
+            if not fits_item(item):
+                return False
+        return True
+
+    return check
+
+
+def _fits_array(dtype: np.dtype[Any], dimensions: int) -> Callable[[Any], bool]:
+    array = np.ndarray
+
+    def check(value: Any) -> bool:
+        if type(value) is not array or value.dtype != dtype or value.ndim != dimensions:
+            return False
+        return value.flags.num & IN_ORDER == IN_ORDER
+
+    return check
