@@ -185,8 +185,8 @@ def test_frames_that_stay_change_nothing_but_add_a_table(
     out, figures = evaluate(capsys, tmp_path / "a.json", *options)
     same, displaced = evaluate(capsys, tmp_path / "b.json", *options, "--frame_offset=0")
     extra = displaced.pop("displaced")
-    for name, figure in figures["all"].items():
-        assert displaced["all"][name] == (figure and pytest.approx(figure, abs=1e-4, rel=1e-6)), name
+    for name, figure in figures["all"].items():  # displaced batches are answered in single precision, pairs in double
+        assert displaced["all"][name] == (figure and pytest.approx(figure, abs=1e-4, rel=1e-5)), name
     assert displaced["all"].keys() == figures["all"].keys()
     assert same.startswith(out)
     assert (extra["metres"], extra["turn"], extra["seed"]) == (0, 0, 0)
@@ -222,7 +222,7 @@ def test_evaluate_names_the_bad_displacement(
     def message(*options: object) -> str:
         return fail(capsys, "evaluate", pairs_dir, *options)
 
-    assert "--frame_offset: expected metres, 0 or more, got -1" in message("--frame_offset=-1")
+    assert "--frame_offset: expected metres from 0 to 1e+06, got -1" in message("--frame_offset=-1")
     assert "--frame_turn: expected radians from 0 to pi, or any, got 4" in message("--frame_turn=4")
     assert "expected no --predictions" in message("--frame_turn=any", "--predictions", predictions_dir)
     for method in ("static", "background", "icp", "ransac"):

@@ -116,7 +116,7 @@ def test_ablations_print_one_table(pairs_dir: Path, tmp_path: Path, capsys: pyte
     [
         ("model: {inference: {speed: 3}}", "speed"),
         ("model: {inference: {clusters: many}}", "clusters"),
-        ("model: {inference: {clusters: 1}}", "clusters: expected at least 2"),
+        ("model: {inference: {clusters: 1}}", "clusters: expected a whole number in [2, 32], got 1"),
         ("model: {features: {left_out: [association.dist2]}}", "left_out: expected one of"),
         ("model: [", "model"),
         ("just words", ""),
