@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchcrf_scan import ClusteringCRF, ExtraLogUnary, FeatureConfig, InferenceConfig, JointScanCRF, MatchingCRF, ModelConfig
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.config import RUN_TIME
 from torchcrf_scan.features.learned import Embeddings
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.selection import evidence
@@ -345,7 +346,8 @@ def test_a_saved_layer_comes_back(tmp_path: Path) -> None:
     with torch.no_grad():
         model.association_weights["embedding"].fill_(2.5)
     model.save_pretrained(tmp_path)
-    again = JointScanCRF.from_pretrained(tmp_path).double()
+    run_time = {name: getattr(model.config.inference, name) for name in RUN_TIME}  # not saved beside weights
+    again = JointScanCRF.from_pretrained(tmp_path, **run_time).double()
     assert again.config == model.config
     assert_identical(again(batch, start, **embeddings()), model(batch, start, **embeddings()))
 

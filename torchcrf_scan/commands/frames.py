@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchcrf_scan.baselines.start import label_nearest
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.fast.choice import can_decode
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction, Uncertainty
@@ -22,8 +23,14 @@ from torchcrf_scan.scan import FARTHEST, PairPrediction, ScanPair
 
 Turn = float | Literal["any"]
 
+
+def predict(model: JointScanCRF, batch: ScanPairBatch) -> Prediction:
+    """The model's answers, in double precision where the loops give them, as `match_pairs` does."""
+    return model(batch.to(torch.float64) if can_decode(model.config, batch.source.device) else batch)
+
+
 METHODS: Mapping[str, Callable[[JointScanCRF, ScanPairBatch], Prediction]] = {
-    "joint": lambda model, batch: model(batch),
+    "joint": predict,
     "start": lambda model, batch: label_nearest(batch, model.initialise(batch)),
 }
 
@@ -65,6 +72,7 @@ def match_displaced(method: str, model: JointScanCRF, pairs: Sequence[tuple[Scan
     offset = torch.stack([offset for _, offset in pairs]).to(reference)  # (B, 3)
     batch = ScanPairBatch.collate(own, reference.dtype).without_truth().to(reference.device).displaced(offset)
     found = METHODS[method](model, batch)
+    offset = offset.to(found.motions)
     back = se2.inverse(offset)[:, None].expand_as(found.motions)
     uncertainty = found.uncertainty and turned(found.uncertainty, -offset[:, 0])
     found = replace(found, motions=se2.compose(back, found.motions), uncertainty=uncertainty)

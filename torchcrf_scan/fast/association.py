@@ -99,9 +99,12 @@ def log_unary_of(
         for k in range(K):
             p = i * K + k
             margins[k] += work.margin[i, k]
+            if not work.mask[i, k]:
+                log_unary[i, k] = -np.inf
+                continue
             excess = min((distance[p] - nearest[i]) / model.cluster_distance, FARTHEST_EXCESS)
             value = values[p] + work.score[i, k] + weights[REGISTERED] * registered[p] + weights[DATA_BOOSTING] * margins[k]
-            log_unary[i, k] = value - weights[EXCESS] * excess if work.mask[i, k] else -np.inf
+            log_unary[i, k] = value - weights[EXCESS] * excess
         value = constant + weights[SEEN_THROUGH] * seen_through[i] + weights[HIDDEN] * hidden[i]
         if weights[OUTLIER_BOOSTING] != 0:
             best = robust_square(nearest[i], model.per_local[REGISTERED])
