@@ -1,6 +1,8 @@
 """Fixtures of all tests: fixed seeds, and the recordings that lie beside the repository but never in it."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +16,18 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one of as many processes as there are
     torch.set_num_threads(1)
     os.environ |= {"OMP_NUM_THREADS": "1", "LOKY_MAX_CPU_COUNT": "1"}
 
+os.environ["TORCHCRF_SCAN_PREPARE"] = "0"  # nothing is built behind the tests
+
 settings.register_profile(  # the same examples in every run, and no failure because the machine is busy
     "repository", derandomize=True, max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("repository")
+
+
+def pytest_sessionstart() -> None:
+    """The machine code is built once, before the processes start that share the tests."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        subprocess.run([sys.executable, "-m", "torchcrf_scan.cli", "prepare"], cwd=Path(__file__).parents[1], check=True)
 
 
 @pytest.fixture(autouse=True)

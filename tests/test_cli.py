@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def test_imports_stay_light() -> None:
     code = (
-        "import sys, torchcrf_scan; heavy = 'matplotlib sklearn scipy tensorboard rosbags'.split();"
+        "import sys, torchcrf_scan; heavy = 'matplotlib sklearn scipy tensorboard rosbags numba'.split();"
         "print([name for name in [*heavy, 'jsonargparse'] if name in sys.modules]);"
         "import torchcrf_scan.cli; print([name for name in heavy if name in sys.modules])"
     )

@@ -59,9 +59,9 @@ def fits(layout: Layout) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, kinds)
 
 
-def _fits_tuple(kind: type, checks: Sequence[Callable[[Any], bool]]) -> Callable[[Any], bool]:
+def _fits_tuple(kind: Any, checks: Sequence[Callable[[Any], bool]]) -> Callable[[Any], bool]:
     def check(value: Any) -> bool:
-        if type(value) is not kind:
+        if type(value) is not kind or len(value) != len(checks):
             return False
         for fits_item, item in zip(checks, value, strict=True):  # noqa: SIM110 (a generator takes twice as long)
             if not fits_item(item):

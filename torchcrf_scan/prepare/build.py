@@ -67,7 +67,7 @@ def _build_level(level: str, parts: Sequence[str], folder: Path) -> Iterator[str
         common = pool.submit(extension.compile_common, level, Path(scratch))
         layouts = record_layouts()
         waiting: dict[Future[tuple[list[str], list[str]]], str] = {}
-        for part in parts:
+        for part in sorted(parts, key=list(machine.PARTS).index):
             own = {name: of for name, of in layouts.items() if machine.part_of(name) == part}
             waiting[pool.submit(extension.compile_objects, part, level, own, Path(scratch))] = part
         for future in as_completed(waiting):

@@ -88,12 +88,10 @@ def _compiler(level: str) -> Any:
 
 def _compile_as_the_loops_need() -> None:
     """Sets numba and pycc up, and puts compiled functions in the place of all kernels of this process, once."""
-    from numba import njit
-    from numba.core import codegen, cpu
-    from numba.core.compiler import Flags
-    from numba.pycc import compiler
+    compiler, codegen, cpu = (_module(name) for name in ("numba.pycc.compiler", "numba.core.codegen", "numba.core.cpu"))
+    Flags = _module("numba.core.compiler").Flags
 
-    def flags() -> Flags:
+    def flags() -> Any:
         made = Flags()
         made.release_gil, made.error_model = True, "numpy"  # pycc's own hold the lock, and raise where a divisor is 0
         made.fastmath = cpu.FastMathOptions(SAFE_MATH)
@@ -104,16 +102,23 @@ def _compile_as_the_loops_need() -> None:
     compiler.Flags = flags
     # What kernels are called by is never called in this process, but must differ from one to another.
     cpu.CPUContext.get_executable = lambda self, library, description, environment: [].append
-    # Entries are optimised with all that is linked into them: to optimise kernels before is a fifth of the time and changes little.
-    codegen.JITCodeLibrary._optimize_final_module = lambda self: None
     codegen.JITCodeLibrary._finalize_specific = lambda self: None
     codegen.JITCPUCodegen._add_module = lambda self, module: None
+    _compile_kernels()
+
+
+def _compile_kernels() -> None:
     for name in (part for parts in machine.PARTS.values() for part in parts):
         import_module("torchcrf_scan." + name.removesuffix(".py").replace("/", "."))
     options = {"nogil": True, "error_model": "numpy", "fastmath": SAFE_MATH, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    compiled = {id(function): njit(**options)(function) for function in jit.KERNELS}
+    compiled = {id(function): _module("numba").njit(**options)(function) for function in jit.KERNELS}
     for module in [module for name, module in sys.modules.items() if name.startswith("torchcrf_scan.")]:
         for name, value in list(vars(module).items()):
             function = value.python if isinstance(value, jit.Entry) else value
             if id(function) in compiled:
                 setattr(module, name, compiled[id(function)])
+
+
+def _module(name: str) -> Any:
+    """One of numba's, whose inner names have no types."""
+    return import_module(name)
