@@ -50,7 +50,7 @@ def robust_square(error: Tensor, scale: Tensor) -> Tensor:
 
 
 def beyond_gate(distance: Tensor, scales: Scales) -> Tensor:
-    """Sigmoid of the distance: 0 well inside the gate of outliers, 1/2 at it, 1 well beyond; from 0.1 to 0.9 within a fifth of it."""
+    """Sigmoid of the distance: 0 well inside the gate of outliers, 1/2 at it, 1 well beyond; 0.1 to 0.9 within a fifth of it."""
     return torch.sigmoid((distance / scales.gate - 1) / GATE_WIDTH)
 
 
