@@ -76,7 +76,7 @@ class InferenceConfig:
 
 
 RUN_TIME = ("stop_early", "detach_motion", "backend", "rotation_tolerance", "translation_tolerance")
-"""The fields of `InferenceConfig` that do not change what the weights mean: they are not saved beside them."""
+"""Fields of `InferenceConfig` that do not affect the meaning of the weights and are not saved with them."""
 
 
 @dataclass(frozen=True)

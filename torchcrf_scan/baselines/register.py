@@ -53,7 +53,7 @@ class Baseline:
 
 
 def call(function: str, *arguments: Any, **settings: Any) -> PairPrediction:
-    """Calls `module:name` of this package, imported on demand: most need scipy or more."""
+    """Calls `module:name` of `baselines`, imported on demand: most need scipy or more."""
     found: PairPrediction = load(f"baselines.{function}")(*arguments, **settings)
     return found
 
