@@ -236,7 +236,7 @@ def indoor(rng: np.random.Generator, start: float, end: float, clutter: float) -
     return World(shapes, False, half_width, 0.0, 0.7 * half_width)
 
 
-# --- what moves ---------------------------------------------------------------------------------------------------------------
+# --- movers -------------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

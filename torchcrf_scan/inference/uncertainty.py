@@ -67,7 +67,7 @@ def motion_covariance(
     normal = torch.einsum("bcn,bcnia,bcnid->bcad", at.weights, at.jacobian, at.jacobian).double() / total[..., None, None]
     information, vectors = torch.linalg.eigh(normal.detach())
     seen = vectors * (information >= LEAST_SHARE)[..., None, :]
-    keep = seen @ vectors.mT  # projection onto what is observed
+    keep = seen @ vectors.mT  # projection onto the observed directions
     pretended = (
         LEAST_SHARE if MOTION_METRICS[metric].along_surface else 0.0
     )  # by the residual noise of the tangents, and by steps along the surface
