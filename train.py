@@ -7,9 +7,9 @@
     torchrun --nproc-per-node 2 train.py --config configs/unrolled.yaml
     python train.py --help
 
-The run folder (`--output`) holds the resolved config, versions, model, metrics, tables, pictures and TensorBoard events, and where
-there are first-order steps (`--gradient.objective`, `--learning.objective unrolled`) a checkpoint: a run that was killed goes on
-with `--resume` and ends as it would have.
+The run folder (`--output`) holds the resolved config, versions, model, metrics, tables, pictures and TensorBoard events, and, for
+first-order training (`--gradient.objective`, `--learning.objective unrolled`), a checkpoint: `--resume` continues an interrupted
+run with the same result as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torchcrf_scan.learning.trainer import train
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Parses the settings, trains, prints the tables. Returns 0, or 1 for bad input; bad settings leave with exit code 2."""
+    """Parses the settings, trains and prints the tables. Returns 0, or 1 for bad input; bad settings exit with code 2."""
     parser = settings_parser(description=__doc__)
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the run folder")
     settings = parser.parse_args(argv)
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"train.py: error: {one_line(error)}", file=sys.stderr)
         return 1
-    if int(os.environ.get("RANK", 0)) == 0:  # the first of the processes that torchrun started
+    if int(os.environ.get("RANK", 0)) == 0:  # the first process of torchrun
         for table in report(scores):
             print(table.to_markdown(), end="\n\n")
         print(f"run folder: {config.output}  (tensorboard --logdir {config.output})")

@@ -1,9 +1,9 @@
-"""Which laser point became which, which points move together, and how: a conditional random field over two planar scans.
+"""Data association, motion clustering and motion estimation between two planar laser scans by a conditional random field.
 
 Dimensions: B pairs, N source points, M target points, K candidates per point, S = K+1 association states (last = outlier),
-D clusters (0 background, 1..D-2 movers, last = outlier; files write the outlier as -1), F features, E edges. Batch first; masks
-are bool, True = real; logarithms are named `log_*`. Frame: x ahead, y left, metres, radians, seconds; `T_target_source` =
-(theta, tx, ty) maps points of the first scan (source) into the frame of the second (target).
+D clusters (0 background, 1..D-2 movers, last = outlier; files store outliers as -1), F features, E edges. Batch first; masks
+are bool, True = real; log-domain quantities are named `log_*`. Frame: x ahead, y left, metres, radians, seconds;
+`T_target_source` = (theta, tx, ty) maps points of the first scan (source) into the frame of the second (target).
 """
 
 from torchcrf_scan.batch import ScanPairBatch

@@ -1,4 +1,4 @@
-"""Pairs as padded tensors with masks, and the model's answer for them."""
+"""Scan pairs as padded tensors with masks."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Truth:
     Attributes:
         association: (B, N) int64 target point, -1 outlier.
         cluster: (B, N) int64 0 background, k >= 1 mover, -1 outlier.
-        motions: (B, G, 3) motion of every annotated cluster, NaN where there is none.
-        known: (B, N) bool, real points that somebody annotated.
+        motions: (B, G, 3) motion of every annotated cluster, NaN for clusters absent from the pair.
+        known: (B, N) bool, real points that are annotated.
     """
 
     association: Tensor
@@ -42,11 +42,11 @@ class ScanPairBatch:
         source_mask: (B, N), target_mask: (B, M). True = real; a scan's real points come first.
         source_closed, target_closed: (B,) bool. The scan covers the whole circle.
         dt: (B,) seconds between the scans.
-        range_noise: (B,) standard deviation of a return, metres; estimated from the scans where the sensor does not say.
-        initial_motion: (B, 3) `T_target_source` guess (odometry); the identity where there is none.
-        truth: the annotation, when every pair has one.
-        target_origin: (B, 2) where the sensor stood when it took the target, in the target's frame; 0 (and zeros if not given)
-            but where that frame was displaced.
+        range_noise: (B,) standard deviation of a range, metres; estimated from the scans if the sensor's is unknown.
+        initial_motion: (B, 3) `T_target_source` guess (odometry); the identity if there is none.
+        truth: the annotation; None unless every pair is annotated.
+        target_origin: (B, 2) position of the target's sensor in the target's frame: 0 (the default) unless that frame was
+            displaced.
     """
 
     source: Tensor
@@ -79,7 +79,7 @@ class ScanPairBatch:
         return ScanPairBatch(**moved, truth=truth)
 
     def __getitem__(self, index: slice) -> ScanPairBatch:
-        """A part of the batch, with the same padding."""
+        """A slice of the batch, with the same padding."""
         if not isinstance(index, slice):
             raise TypeError(f"index: expected a slice, got {type(index).__name__}")
         part = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "truth"}
@@ -99,7 +99,7 @@ class ScanPairBatch:
         return ScanPairBatch(**part, truth=truth)
 
     def scaled(self, factor: Tensor) -> ScanPairBatch:
-        """The same scenes in another unit of length, a factor (B,) a pair."""
+        """The same scenes in another unit of length; factor: (B,) scale of each pair."""
         by_pair = factor[:, None, None]
         truth = self.truth and replace(self.truth, motions=scale_motions(self.truth.motions, factor))
         return replace(
@@ -113,7 +113,7 @@ class ScanPairBatch:
         )
 
     def displaced(self, offset: Tensor) -> ScanPairBatch:
-        """The same scenes with the target given in another frame, of which `initial_motion` knows nothing.
+        """The same scenes with the target expressed in another frame; `initial_motion` is left unchanged.
 
         Args:
             offset: (B, 3) motion of the target's points into the new frame.
@@ -129,15 +129,15 @@ class ScanPairBatch:
         )
 
     def without_truth(self) -> ScanPairBatch:
-        """The batch as a user brings it, without annotation."""
+        """The batch without its annotation."""
         return replace(self, truth=None)
 
     @classmethod
     def collate(cls, pairs: Sequence[ScanPair], dtype: torch.dtype = torch.float32) -> ScanPairBatch:
-        """Pads pairs into one batch (at least one, masked, point a scan). The truth is there when every pair is annotated.
+        """Pads pairs into one batch, each scan to at least one (masked) point; `truth` is set if every pair is annotated.
 
         Raises:
-            ValueError: no pairs, or a number that the dtype does not hold.
+            ValueError: no pairs, or a number that overflows the dtype.
         """
         if not pairs:
             raise ValueError("pairs: expected at least one pair, got none")
@@ -161,7 +161,7 @@ class ScanPairBatch:
 
 
 def finite(name: str, values: Tensor) -> Tensor:
-    """The values; ValueError where one is not finite, as what is too large for a dtype becomes."""
+    """The values, unchanged; raises ValueError if one is not finite, e.g. after overflow of a dtype."""
     wrong = values[~torch.isfinite(values)]
     if len(wrong):
         raise ValueError(f"{name}: expected finite numbers of {values.dtype}, got {wrong[0].item()}")
@@ -169,7 +169,7 @@ def finite(name: str, values: Tensor) -> Tensor:
 
 
 def scale_motions(motions: Tensor, factor: Tensor) -> Tensor:
-    """(B, ..., 3) motions in another unit of length, a factor (B,) a pair."""
+    """(B, ..., 3) motions in another unit of length; factor: (B,) scale of each pair."""
     by_pair = factor.view(-1, *[1] * (motions.dim() - 1))
     return torch.cat([motions[..., :1], motions[..., 1:] * by_pair], dim=-1)
 
@@ -185,7 +185,7 @@ def _pad_points(scans: Sequence[Scan]) -> tuple[Tensor, Tensor]:
 
 
 def initial_motion_of(pair: ScanPair) -> Floats:
-    """(3,) the guess, the identity where there is none."""
+    """(3,) the pair's initial guess; the identity if it has none."""
     if pair.initial_motion is None:
         return np.zeros(3)
     guess = np.asarray(pair.initial_motion, dtype=np.float64)
@@ -195,7 +195,10 @@ def initial_motion_of(pair: ScanPair) -> Floats:
 
 
 def range_noise_of(pair: ScanPair) -> float:
-    """What the sensor says, else an estimate: on smooth surfaces the ranges' second difference is noise alone."""
+    """The sensor's range noise, metres; if unknown, estimated from the ranges.
+
+    On smooth surfaces the second differences of the ranges are noise alone.
+    """
     stated = [scan.range_noise for scan in (pair.source, pair.target) if scan.range_noise is not None]
     if stated:
         return max(stated)
@@ -213,7 +216,7 @@ def _collate_truth(pairs: Sequence[ScanPair], source_mask: Tensor, dtype: torch.
     for b, pair in enumerate(pairs):
         truth, beam, n = pair.annotation, pair.source.beam, len(pair.source)
         assert truth is not None
-        point_of_beam = np.full(pair.target.n_beams + 1, -1)  # the last entry keeps -1 at -1
+        point_of_beam = np.full(pair.target.n_beams + 1, -1)  # the last entry maps -1 to -1
         point_of_beam[pair.target.beam] = np.arange(len(pair.target))
         association[b, :n] = point_of_beam[truth.association[beam]]
         cluster[b, :n] = truth.cluster[beam]

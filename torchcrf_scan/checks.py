@@ -1,7 +1,7 @@
-"""Checks of settings: every error names the setting, what was expected and what it got.
+"""Validation of settings: every error names the setting, the expected value and the value given.
 
-A field of a dataclass of settings says in its annotation what it may be, e.g. `Annotated[int, Within(1, 100)]`; `check_fields`
-converts and checks them all where the dataclass is made, whoever makes it: a command, a file, or Python.
+The annotation of a settings field holds its bounds, e.g. `Annotated[int, Within(1, 100)]`; `check_fields` converts and
+checks all fields when the dataclass is constructed, whether from a command, a file or Python.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 Settings = TypeVar("Settings")
 
 UNIONS = (Union, UnionType)
-SHOWN = 80  # letters of a wrong value that a message repeats
+SHOWN = 80  # characters of a wrong value that a message repeats
 
 
 @dataclass(frozen=True, slots=True)
 class Within:
-    """A number may be from `least` to `most`; with `above` it must be more than `least`, with `below` less than `most`."""
+    """Bounds of a number: from `least` to `most`; `above` excludes `least`, `below` excludes `most`."""
 
     least: float = -math.inf
     most: float = math.inf
@@ -32,7 +32,7 @@ class Within:
     below: bool = False
 
     def allows(self, value: float) -> bool:
-        """Whether a number lies within; NaN never does."""
+        """Whether a number lies within the bounds; NaN never does."""
         is_low = value > self.least if self.above else value >= self.least
         return is_low and (value < self.most if self.below else value <= self.most)
 
@@ -43,13 +43,13 @@ class Within:
 
 
 class OneOf:
-    """A text may be one of a few."""
+    """A string out of a fixed set of choices."""
 
     def __init__(self, *choices: str) -> None:
         self.choices = choices
 
     def allows(self, value: str) -> bool:
-        """Whether it is one of them."""
+        """Whether a string is one of the choices."""
         return value in self.choices
 
     def __str__(self) -> str:
@@ -59,14 +59,14 @@ class OneOf:
 Share = Annotated[float, Within(0, 1)]
 Amount = Annotated[float, Within(0)]
 Positive = Annotated[float, Within(0, above=True)]
-Seed = Annotated[int, Within(0, 2**31 - 1)]  # what every generator takes, a few more being added here and there
+Seed = Annotated[int, Within(0, 2**31 - 1)]  # range of every random generator, with room for small offsets
 
 
 def check_fields(settings: Any, prefix: str = "") -> None:
     """Converts every field of a frozen dataclass to its type (2 to 2.0, a list to a tuple) and checks its bounds.
 
     Args:
-        settings: what `__post_init__` is called with.
+        settings: the instance under construction; called from `__post_init__`.
         prefix: of the names in messages, e.g. `gradient.`.
 
     Raises:
@@ -79,10 +79,10 @@ def check_fields(settings: Any, prefix: str = "") -> None:
 
 
 def from_values(kind: Callable[..., Settings], values: object, name: str) -> Settings:
-    """Settings from what `asdict` made of them, as a file holds it; what is missing there has its default.
+    """Settings from a dictionary as produced by `asdict` and stored in files; missing keys take their defaults.
 
     Raises:
-        ValueError: not a dictionary, a setting that there is not, or a value that `check_fields` refuses.
+        ValueError: not a dictionary, an unknown setting, or a value rejected by `check_fields`.
     """
     if not isinstance(values, Mapping):
         raise ValueError(f"{name}: expected settings by name, got {_shown(values)}")
@@ -95,13 +95,13 @@ def from_values(kind: Callable[..., Settings], values: object, name: str) -> Set
 
 @cache
 def _annotations(kind: Any) -> dict[str, Any]:
-    """The fields of a dataclass, with all that their annotations say."""
+    """The fields of a dataclass with their full type annotations."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: hints[field.name] for field in fields(kind)}
 
 
 def _converted(name: str, hint: Any, value: Any) -> Any:
-    """The value as the annotation has it."""
+    """The value converted to its annotated type."""
     base, bounds = (hint.__origin__, hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
     if not _suits(base, value):
         raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
@@ -116,7 +116,7 @@ def _converted(name: str, hint: Any, value: Any) -> Any:
 
 
 def _suits(base: Any, value: Any) -> bool:
-    """Whether a value is of a type, or can be converted to it without loss; numbers must be finite."""
+    """Whether a value is of a type or converts to it without loss; numbers must be finite."""
     if get_origin(base) in UNIONS:
         return any(_suits(of, value) for of in get_args(base))
     if get_origin(base) is tuple:
@@ -131,12 +131,12 @@ def _suits(base: Any, value: Any) -> bool:
 def _is_finite(value: Real) -> bool:
     try:
         return math.isfinite(value)
-    except OverflowError:  # a whole number that no float holds
+    except OverflowError:  # an integer too large for a float
         return False
 
 
 def _description(hint: Any) -> str:
-    """What an annotation allows, in words."""
+    """The values that an annotation allows, in words."""
     if get_origin(hint) is Annotated:
         bounds = "".join(map(str, hint.__metadata__))
         return bounds.removeprefix(": ") if hint.__origin__ is str else _description(hint.__origin__) + bounds

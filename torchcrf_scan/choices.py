@@ -1,4 +1,4 @@
-"""What a model is chosen from by name, and what every variant can do: one line each, asked by all who would compare names.
+"""Registers of the model's variants and their abilities, one line each; all comparisons of variant names go through them.
 
 A new variant is a module with its function and a line here; `config` accepts its name, `variants.register` loads it.
 """
@@ -13,14 +13,14 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variant:
-    """What models with a variant can do.
+    """Abilities of models that use a variant.
 
     Attributes:
-        function: what computes it, as `module:name` within the package; empty where the modules that need it know it by name.
+        function: its implementation, as `module:name` within the package; empty if the modules that need it handle it by name.
         has_gradient: gradients pass through the rounds to weights and points.
-        takes_extras: `forward` takes embeddings and extra log potentials, which an encoder makes too.
-        is_exportable: the rounds are a program without Python (`export`).
-        in_loops: the loops (`fast`) have it.
+        takes_extras: `forward` accepts embeddings and extra log potentials, including those of an encoder.
+        is_exportable: the rounds can be exported as a program without Python (`export`).
+        in_loops: implemented by the loops (`fast`) too.
     """
 
     function: str = ""
@@ -32,10 +32,10 @@ class Variant:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Schedule(Variant):
-    """In which order messages pass: `function(view, start, parameters, model)` decodes.
+    """Message schedule: `function(view, start, parameters, model)` decodes.
 
     Attributes:
-        takes_couplings: it goes in rounds, of any coupling.
+        takes_couplings: the schedule works in rounds and supports every coupling.
     """
 
     takes_couplings: bool = True
@@ -43,11 +43,11 @@ class Schedule(Variant):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Coupling(Variant):
-    """How the chains see each other: `function(view, start, state, found, parameters, model)` updates both.
+    """Coupling of the two chains: `function(view, start, state, found, parameters, model)` updates both.
 
     Attributes:
         likelihood: `function(view, plugins, parameters, model)` of the annotation.
-        chain: what makes the one chain of both labels from plug-ins, for a model that has no chain alone; empty: two chains.
+        chain: builds the single chain over joint labels from plug-ins; empty: two separate chains.
     """
 
     likelihood: str
@@ -56,7 +56,7 @@ class Coupling(Variant):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chains(Variant):
-    """Which chains a model has. One that has no clusters has one motion, one that has no associations takes those given."""
+    """The chains of a model. Without clusters there is one motion; without associations those of the start are used."""
 
     has_association: bool = True
     has_clusters: bool = True
@@ -64,10 +64,10 @@ class Chains(Variant):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionMetric(Variant):
-    """How motions follow from labels: `inference.motion.FITS`.
+    """Estimator of motions from labels: `inference.motion.FITS`.
 
     Attributes:
-        is_fitted: motions are fitted at all. along_surface: a point may slide along the target's surface at next to no cost.
+        is_fitted: motions are fitted at all. along_surface: a point may slide along the target's surface at little cost.
     """
 
     is_fitted: bool = True
@@ -85,7 +85,7 @@ SCHEDULES: Mapping[str, Schedule] = {
         takes_couplings=False,
     ),
 }
-STARTS: Mapping[str, Variant] = {  # function(view, found, parameters, inference) makes it from that of the search
+STARTS: Mapping[str, Variant] = {  # function(view, found, parameters, inference) builds the start from that of the search
     "search": Variant(),
     "paper": Variant(function="variants.paper_start:paper_start", in_loops=False),
     "points": Variant(function="variants.points_start:points_start", in_loops=False),
@@ -114,7 +114,7 @@ MOVERS: Mapping[str, Variant] = {"joint": Variant(), "threshold": Variant()}
 CANDIDATE_SEARCHES: Mapping[str, Variant] = {
     "motion": Variant(),
     "position": Variant(in_loops=False),
-    "shape": Variant(is_exportable=False, in_loops=False),  # how many points are compared at once depends on the pairs
+    "shape": Variant(is_exportable=False, in_loops=False),  # the number of comparisons per chunk depends on the batch
 }
 
 OF_INFERENCE: Mapping[str, Mapping[str, Variant]] = {  # by setting of `InferenceConfig`
@@ -125,14 +125,14 @@ OF_INFERENCE: Mapping[str, Mapping[str, Variant]] = {  # by setting of `Inferenc
     "motion_metric": MOTION_METRICS,
 }
 OF_MODEL: Mapping[str, Mapping[str, Variant]] = {"chains": CHAINS, "coupling": COUPLINGS, "start": STARTS}  # of `ModelConfig`
-OF_ROUNDS: Mapping[str, Mapping[str, Variant]] = {**OF_INFERENCE, "chains": CHAINS, "coupling": COUPLINGS}  # whatever the start
+OF_ROUNDS: Mapping[str, Mapping[str, Variant]] = {**OF_INFERENCE, "chains": CHAINS, "coupling": COUPLINGS}  # for any start
 
 
 def with_ability(register: Mapping[str, Variant], ability: str) -> tuple[str, ...]:
-    """The names of the variants that have an ability, a field of `Variant`."""
+    """Names of the variants that have an ability (a boolean field of `Variant`)."""
     return tuple(name for name, variant in register.items() if getattr(variant, ability))
 
 
 def load(function: str) -> Any:
-    """The function that `module:name` names within the package."""
+    """The function at `module:name` within the package."""
     return resolve_name(f"{__package__}.{function}")

@@ -1,6 +1,6 @@
-"""The command `torchcrf-scan`: every subcommand is a typed function, its options and help come from signature and docstring.
+"""The command `torchcrf-scan`: every subcommand is a typed function; its options and help come from signature and docstring.
 
-Exit codes: 0 done, 1 bad input (one line on stderr says which), 2 bad usage. What only one command needs is imported there.
+Exit codes: 0 done, 1 bad input (one line on stderr), 2 bad usage. Dependencies of a single command are imported there.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
     "prepare": prepare,
 }
 
-POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: what is given, how many (one where None), meaning
+POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: metavar, nargs (None: exactly one), help
     "files": ("PAIR.npz|LOG", "+", f"pair files (.npz), folders of them, logs ({ENDINGS}), or glob patterns"),
     "pair_files": ("PAIR.npz", "+", "pair files (.npz), folders of them, or glob patterns"),
     "file": ("PAIR.npz|LOG", None, f"a pair file (.npz), or with --number a log ({ENDINGS})"),
@@ -41,10 +41,10 @@ POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: what is 
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command and returns the exit code; bad usage and `--help` leave through `SystemExit`, as argparse does.
+    """Runs one command and returns the exit code; bad usage and `--help` raise `SystemExit`, as in argparse.
 
     Args:
-        argv: arguments without the program's name; those of the process where absent.
+        argv: arguments without the program's name; None: those of the process.
     """
     parser = make_parser()
     parsed = parser.parse_args(None if argv is None else list(argv))
@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         options = parser.instantiate(parsed)[parsed.command]
         code = COMMANDS[parsed.command](**vars(options))
         sys.stdout.flush()
-    except BrokenPipeError:  # whoever reads our output has seen enough (`| head`)
+    except BrokenPipeError:  # the reader of our output closed the pipe (`| head`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (ValueError, OSError) as error:
@@ -76,7 +76,7 @@ def make_parser() -> ArgumentParser:
 
 
 def _command_parser(name: str, command: Callable[..., int], summary: str) -> ArgumentParser:
-    """Options from the signature; a parameter of `POSITIONAL` is given without a dash."""
+    """Options from the signature; parameters in `POSITIONAL` become positional arguments."""
     parameters = inspect.signature(command).parameters
     forms = {key: metavar + (" ..." if count else "") for key, (metavar, count, _) in POSITIONAL.items()}
     shown = [form for key, form in {**forms, "output": "--output OUTPUT"}.items() if key in parameters]

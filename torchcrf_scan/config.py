@@ -1,4 +1,4 @@
-"""Every setting of the package as frozen dataclasses; `configs/*.yaml` and the command line fill them in (jsonargparse)."""
+"""All settings of the package as frozen dataclasses, filled from `configs/*.yaml` and the command line (jsonargparse)."""
 
 from __future__ import annotations
 
@@ -29,28 +29,29 @@ LEFT_OUT = (
 
 @dataclass(frozen=True)
 class InferenceConfig:
-    """How the model is decoded (spec 7).
+    """Settings of inference (spec 7).
 
     Attributes:
         clusters: D, states of the clustering chain: background, movers, outlier.
         candidates: K inlier states of a point; 0 = every target point (dense).
-        iterations: rounds at most.
-        stop_early: stop when everything has settled; off, exactly `iterations` rounds are unrolled.
+        iterations: maximum number of rounds.
+        stop_early: stop at convergence; off, exactly `iterations` rounds are unrolled.
         temperature: 0 = max-product, 1 = sum-product.
-        motion_metric: `point` (Kabsch, the paper's) or `line` (robust point-to-line step); or `given`: the motions stay those of
-            the start (in the `sweep`).
-        motion_weights: `hard` (labels, the paper's) or `soft` (beliefs; lets gradients reach the weights).
-        movers: `joint`: the clustering chain has its say in which hypothesised movers there are; `threshold`: their score decides
-            (so in `flooding`).
+        motion_metric: `point` (Kabsch, the paper's), `line` (robust point-to-line step) or `given`: the motions stay those of
+            the start (`sweep` only).
+        motion_weights: `hard` (labels, the paper's) or `soft` (beliefs; gradients then reach the weights).
+        movers: `joint`: hypothesised movers are selected by their score and the clustering chain; `threshold`: by their score alone
+            (always so in `flooding`).
         schedule: `sweep` (exact passes over each chain, motions between) or `flooding` (Algorithm 1 node by node).
         flooding_order: `alternate` or `ascending` (A-20), for flooding only.
-        candidate_search: the K nearest under the present motions (`motion`), in raw position (`position`), or the K most alike in
-            shape (`shape`).
-        min_extent: metres (in the unit `spacing`, those of a street scanner); a smaller cluster takes the background's rotation.
+        candidate_search: the K nearest under the present motions (`motion`), in raw position (`position`), or the K most similar
+            in shape (`shape`).
+        min_extent: metres (scaled as by `length_unit: spacing`); a smaller cluster takes the background's rotation.
         detach_motion: no gradient passes through a motion into the features of the next pass; motions keep their own.
-        backend: `compiled` (numba, extra `fast`: on a CPU, without gradients) or `eager`; `auto`: compiled where that is possible.
-        rotation_tolerance: radians below which a motion has settled.
-        translation_tolerance: metres below which a motion has settled.
+        backend: engine of the rounds: `compiled` (loops in machine code, on a CPU, without gradients) or `eager` (tensors);
+            `auto`: compiled where that is possible.
+        rotation_tolerance: radians; a motion whose rotation changes by less has converged.
+        translation_tolerance: metres; a motion whose translation changes by less has converged.
     """
 
     clusters: Annotated[int, Within(2, 32)] = 8
@@ -75,30 +76,30 @@ class InferenceConfig:
 
 
 RUN_TIME = ("stop_early", "detach_motion", "backend", "rotation_tolerance", "translation_tolerance")
-"""The fields of `InferenceConfig` that do not change what the weights mean: they are not saved beside them."""
+"""Fields of `InferenceConfig` that do not affect the meaning of the weights and are not saved with them."""
 
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """Which features the model has.
+    """Settings of the features.
 
     Attributes:
-        free_space: what beams see through and what hides from them, as extension weights of both chains (design finding 13).
-        decisions: what parts inliers from outliers and the nearest target point from others, as extension weights of both chains:
-            a gate on the residual, a constant, the lead of the nearest. This and `free_space` off: the paper's 30.
-        left_out: features that the model does without, as `association.NAME` or `clustering.NAME` of a weight; a local channel is
-            then hidden from the boosters too. By default the two that compare an edge's length, which call sparsely sampled
-            surfaces outliers, and the decisions of the clustering chain, which cost it movers.
-        length_unit: what lengths are measured in: `spacing` (what each pair's own scans resolve, so one set of weights serves a
-            street and a table top) or `metre`, the paper's.
+        free_space: free-space and occlusion features, as extension weights of both chains (design finding 13).
+        decisions: features for the inlier/outlier decision and for the nearest target point, as extension weights of both chains:
+            a gate on the residual, a constant, the excess over the nearest. This and `free_space` off: the paper's 30.
+        left_out: features left out of the model, as `association.NAME` or `clustering.NAME` of a weight; a local channel is
+            then hidden from the boosters too. By default the two that compare an edge's length, which reject sparsely sampled
+            surfaces as outliers, and the decisions of the clustering chain, which cost it movers.
+        length_unit: unit of lengths in the features: `spacing` (from the point spacing of each pair's scans, so one set of weights
+            serves a street and a table top) or `metre`, the paper's.
         embedding: `dot` (scaled dot product) or `cosine`: the similarity of embeddings given to `forward` scores associations
-            (`features.learned`), with two named weights more; or `none`.
+            (`features.learned`), with two additional weights; or `none`.
         raw_channels: the 12 local channels enter the potentials beside the boosted scores (W-A); off, they only feed the boosters
             (W-B, the literal text).
         wrap_closed: neighbours wrap round a closed scan (A-06); off, they clamp as in the paper.
         stumps: decision stumps in each booster.
         smooth: width of the stumps' sigmoids, in units of the boosted features (robust squares, 0 to -9); 0: steps. As the width
-            goes to 0 the margins become those of the steps that were fitted; a tenth changes hardly an answer. Above 0, gradients
+            goes to 0 the margins approach those of the fitted steps; 0.1 leaves almost all labels unchanged. Above 0, gradients
             reach points and motions through them.
         learn_stumps: thresholds and tables of the boosters are parameters, learned with the weights; needs `smooth` above 0.
     """
@@ -126,8 +127,8 @@ class EncoderConfig:
 
     Attributes:
         width: channels of its layers; 0: the model has no encoder.
-        dilations: points between the taps of each layer; twice their sum is how far it sees along a scan.
-        embedding: channels of the embeddings it makes beside its log potentials, which needs `features.embedding`; 0: none.
+        dilations: points between the taps of each layer; twice their sum is the receptive field along a scan.
+        embedding: channels of its embeddings, in addition to its log potentials; needs `features.embedding`; 0: none.
     """
 
     width: Annotated[int, Within(0, 4096)] = 0
@@ -140,14 +141,14 @@ class EncoderConfig:
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Everything that `save_pretrained` writes beside the weights.
+    """Settings saved with the weights by `save_pretrained`.
 
     Attributes:
         chains: `joint`, or one chain alone: `matching`, `clustering`.
-        coupling: of the joint chains: `motions` (the paper's) or `lattice`: both labels of a point are decided at once (spec 7.7).
+        coupling: of the joint chains: `motions` (the paper's) or `lattice`: both labels of a point are decided jointly (spec 7.7).
         start: `search` (hypotheses over the whole scene), `paper` (spec 7.3: association chain, then runs of residuals) or `points`
             (the same chain, then one cluster a point, of which the vacuous ones are discarded).
-        encoder: of the scans' points; by default there is none.
+        encoder: of the scans' points; none by default.
     """
 
     chains: Annotated[str, OneOf(*CHAINS)] = "joint"
@@ -182,15 +183,15 @@ class ModelConfig:
 
     @property
     def motions(self) -> int:
-        """C: motions of the background and of as many movers as there may be."""
+        """C: number of motions, the background and the maximum number of movers."""
         return self.inference.clusters - 1 if self.has_clusters else 1
 
     def without(self, ability: str) -> dict[str, str]:
-        """The settings of the rounds, with their values, whose variant lacks an ability (`choices.Variant`)."""
+        """The settings of the rounds whose variant lacks an ability (`choices.Variant`), with their values."""
         chosen = {name: getattr(self.inference if name in OF_INFERENCE else self, name) for name in OF_ROUNDS}
         return {name: value for name, value in chosen.items() if not getattr(OF_ROUNDS[name][value], ability)}
 
     def require(self, ability: str, purpose: str) -> None:
-        """Raises ValueError where a variant lacks an ability that a purpose needs."""
+        """Raises ValueError if a variant lacks an ability that a purpose needs."""
         for name, value in self.without(ability).items():
             raise ValueError(f"{name}: expected {' or '.join(with_ability(OF_ROUNDS[name], ability))} {purpose}, got {value}")

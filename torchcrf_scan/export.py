@@ -2,9 +2,9 @@
 
     motions ──► fixed number of rounds ──► labels, motions, beliefs
 
-InitialiseRT follows what it sees and stays outside: the motions to begin with are given. For a model that does not stop early,
-`torch.export.export(model, (batch, start))` works too and has all of a `Prediction`; here there are plain tensors with names, which
-is what a runtime takes.
+InitialiseRT has data-dependent control flow and is not exported: initial motions are inputs. For a model without early
+stopping, `torch.export.export(model, (batch, start))` works too and returns a full `Prediction`; here inputs and outputs
+are plain named tensors, as runtimes need them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.variants import sweep
 
-OPSET = 18  # of ONNX
+OPSET = 18  # ONNX opset
 FROM_BATCH = (
     *("source", "target", "source_mask", "target_mask", "source_closed", "target_closed"),
     *("range_noise", "initial_motion", "target_origin"),
@@ -39,10 +39,10 @@ OUTPUTS = (
 
 
 class UnrolledDecoder(nn.Module):
-    """The model from given motions on, as a function of plain tensors; its answers are those of the model at that start.
+    """The model from given initial motions on, as a function of plain tensors; equal to the model's output at that start.
 
     Args:
-        model: its weights are shared; it decodes on tensors (backend `eager`) and does not stop early.
+        model: its weights are shared; it decodes on tensors (backend `eager`) without early stopping.
         iterations: rounds; None: the model's.
         plain: with `PlainOperators`, for other runtimes.
     """
@@ -73,9 +73,9 @@ class UnrolledDecoder(nn.Module):
     ) -> dict[str, Tensor]:
         """The fields `OUTPUTS` of a `Prediction`.
 
-        The first nine inputs are those of a `ScanPairBatch`, the others those of a `Start`: motions (B, C, 3) and which of them
-        exist (B, C), and where InitialiseRT found them, all that it says. Without association and tangents these follow from the
-        motions (`Start.at`).
+        The first nine inputs are fields of a `ScanPairBatch`, the others those of a `Start`: motions (B, C, 3) and which of them
+        exist (B, C), and the remaining fields of a start from InitialiseRT. Without association and tangents these are derived from
+        the motions (`Start.at`).
         """
         batch = ScanPairBatch(
             source=source,
@@ -84,7 +84,7 @@ class UnrolledDecoder(nn.Module):
             target_mask=target_mask,
             source_closed=source_closed,
             target_closed=target_closed,
-            dt=torch.zeros_like(range_noise),  # only InitialiseRT asks for it
+            dt=torch.zeros_like(range_noise),  # used by InitialiseRT only
             range_noise=range_noise,
             initial_motion=initial_motion,
             target_origin=target_origin,
@@ -116,7 +116,7 @@ class UnrolledDecoder(nn.Module):
 
 
 def unrolled_config(config: ModelConfig, iterations: int | None = None) -> ModelConfig:
-    """The settings with a fixed number of rounds (None: as many as there may be) on tensors."""
+    """The settings with a fixed number of rounds (None: the configured maximum), decoded on tensors."""
     config.require("is_exportable", "for a model to export")
     rounds = config.inference.iterations if iterations is None else iterations
     return replace(config, inference=replace(config.inference, backend="eager", stop_early=False, iterations=rounds))
@@ -125,7 +125,8 @@ def unrolled_config(config: ModelConfig, iterations: int | None = None) -> Model
 def decoder_inputs(batch: ScanPairBatch, start: Start | Tensor) -> dict[str, Tensor]:
     """The arguments of `UnrolledDecoder.forward` by name.
 
-    start: what InitialiseRT found, or (B, C, 3) motions alone, all of which exist.
+    Args:
+        start: output of InitialiseRT, or (B, C, 3) motions alone, all of which exist.
     """
     if isinstance(start, Tensor):
         of_start = {"motions": start, "active": torch.ones_like(start[..., 0], dtype=torch.bool)}
@@ -134,7 +135,7 @@ def decoder_inputs(batch: ScanPairBatch, start: Start | Tensor) -> dict[str, Ten
     of_batch = {name: getattr(batch, name) for name in FROM_BATCH}
     return of_batch | {
         f"start_{name}": value for name, value in of_start.items()
-    }  # a graph's names are one space: motions go out too
+    }  # names are unique within a graph, and `motions` is an output too
 
 
 def export_program(
@@ -142,7 +143,7 @@ def export_program(
 ) -> ExportedProgram:
     """The unrolled rounds as a `torch.export` program of `UnrolledDecoder`, for any number of pairs.
 
-    The steps of the messages follow the source points one by one, so N is that of the example: pad scans to the longest to come.
+    The message passing is unrolled over the source points, so N is fixed to that of the example: pad scans to the longest expected.
     """
     inputs = {name: value if len(value) > 1 else torch.cat([value, value]) for name, value in decoder_inputs(batch, start).items()}
     pairs = Dim("pairs")
@@ -153,9 +154,9 @@ def export_program(
 
 
 def export_onnx(path: str | Path, program: ExportedProgram) -> None:
-    """Writes what `export_program` made as an ONNX file of opset `OPSET`, whole or not at all; needs the extra `export`.
+    """Writes a program from `export_program` as an ONNX file of opset `OPSET`, atomically; needs the extra `export`.
 
-    Inputs are `decoder_inputs`, outputs `OUTPUTS`; candidates that are impossible may be others than the model's.
+    Inputs are `decoder_inputs`, outputs `OUTPUTS`; the indices of impossible candidates may differ from the model's.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
@@ -168,12 +169,12 @@ def export_onnx(path: str | Path, program: ExportedProgram) -> None:
 
 
 class PlainOperators(TorchFunctionMode):
-    """Within it, what ONNX has no operator for is computed by operators that it has, and gradients that are off stay off silently:
-    every switch would be a program in the program, which takes a fifth of the time of an export.
+    """Context that replaces operators missing in ONNX by supported ones and ignores switches of the gradient mode: each switch
+    would become a nested program, which takes a fifth of the time of an export.
     """
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """The function itself, or its counterpart."""
+        """The function itself, or its replacement."""
         if func is torch._C._set_grad_enabled and args[0] == torch.is_grad_enabled():
             return None
         own = {torch.searchsorted: count_below, Tensor.nanmedian: middle_of_known, torch.linalg.solve_ex: eliminate}
@@ -181,12 +182,12 @@ class PlainOperators(TorchFunctionMode):
 
 
 def count_below(sorted_sequence: Tensor, values: Tensor) -> Tensor:
-    """`torch.searchsorted` from the left, every value against every entry. sorted_sequence: (R, M); values: (R, P)."""
+    """`torch.searchsorted` from the left, by comparing every value with every entry. sorted_sequence: (R, M); values: (R, P)."""
     return (sorted_sequence[:, None] < values[..., None]).sum(-1)
 
 
 def middle_of_known(values: Tensor, dim: int) -> torch.return_types.nanmedian:
-    """`torch.nanmedian`: the lower of two middle ones, and its index; NaN where all are."""
+    """`torch.nanmedian`: the lower of the two middle values, and its index; NaN if all values are NaN."""
     ordered, index = values.masked_fill(values.isnan(), torch.inf).sort(dim)
     known = (~values.isnan()).sum(dim, keepdim=True)
     place = (known - 1).clamp(min=0) // 2
@@ -195,7 +196,7 @@ def middle_of_known(values: Tensor, dim: int) -> torch.return_types.nanmedian:
 
 
 def eliminate(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """`torch.linalg.solve_ex` of positive definite systems of one right side by elimination without a pivot: nothing can fail.
+    """`torch.linalg.solve_ex` for positive definite systems with one right side, by elimination without pivoting; never fails.
 
     matrix: (..., n, n); right: (..., n). Returns (..., n) and (...) zeros.
     """
@@ -205,7 +206,7 @@ def eliminate(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         for below in range(i + 1, n):
             share = rows[below][i] / rows[i][i]
             rows[below] = [b - share * a for a, b in zip(rows[i], rows[below], strict=True)]
-    solution: list[Tensor] = []  # from the last
+    solution: list[Tensor] = []  # in reverse order
     for i in reversed(range(n)):
         rest = sum((a * x for a, x in zip(rows[i][n - 1 : i : -1], solution, strict=True)), start=torch.zeros_like(rows[i][n]))
         solution.append((rows[i][n] - rest) / rows[i][i])

@@ -1,4 +1,4 @@
-"""The layer: a conditional random field over two scans (van de Ven, Ramos, Tipaldi, ICRA 2010)."""
+"""The conditional random field over two scans as a torch module (van de Ven, Ramos, Tipaldi, ICRA 2010)."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ BothEmbeddings = tuple[Tensor | None, Tensor | None]  # of source and target
 class JointScanCRF(nn.Module):
     """Data association, clustering and motions of B scan pairs by a log-linear conditional random field.
 
-    Parameters: one named weight a feature. The paper has thirty, 18 of the association chain and 12 of the clustering chain
-    (spec 5.1); extensions that are on (`FeatureConfig`) and embeddings (`features.learned`) add theirs. Buffers: boosters, scales
+    Parameters: one named weight per feature. The paper has thirty, 18 of the association chain and 12 of the clustering chain
+    (spec 5.1); enabled extensions (`FeatureConfig`) and embeddings (`features.learned`) add theirs. Buffers: boosters, scales
     of the features and the score of hypothesised movers, which are fitted before the weights (`torchcrf_scan.learning`); with
     `features.learn_stumps` the boosters are parameters. With `encoder` a `ScanEncoder` adds log potentials and embeddings.
 
@@ -71,13 +71,13 @@ class JointScanCRF(nn.Module):
         self.reset_parameters()
 
     def _zeros(self, chain: str, names: Sequence[str]) -> nn.ParameterDict:
-        """A parameter for every weight that the model has."""
+        """One parameter for every weight of the model."""
         own = [name for name in names if has_weight(self.config.features, f"{chain}.{name}")]
         return nn.ParameterDict([(name, nn.Parameter(torch.zeros(()))) for name in own])
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """Weights that decode something sensible before any learning: near in motion, in sequence, alike in shape."""
+        """Sets hand-chosen weights that decode reasonably without training: near in motion, in sequence, similar in shape."""
         for weight in (*self.association_weights.values(), *self.clustering_weights.values()):
             weight.zero_()
         if "embedding" in self.association_weights:
@@ -90,13 +90,13 @@ class JointScanCRF(nn.Module):
             self.clustering_weights[name].fill_(value)
 
     def extra_repr(self) -> str:
-        """The settings that decide the shapes."""
+        """The settings that determine the shapes."""
         c = self.config.inference
         return f"chains={self.config.chains}, clusters={c.clusters}, candidates={c.candidates or 'dense'}, schedule={c.schedule}"
 
     @property
     def weight_vectors(self) -> tuple[Tensor, Tensor]:
-        """(23,) and (20,): the weights in the order of `ASSOCIATION_WEIGHTS` and `CLUSTERING_WEIGHTS`, 0 for what is left out."""
+        """(23,) and (20,): the weights in the order of `ASSOCIATION_WEIGHTS` and `CLUSTERING_WEIGHTS`, 0 for left-out features."""
         none = torch.zeros_like(self.association_weights["sequence"])
         own = dict(self.association_weights.named_parameters()), dict(self.clustering_weights.named_parameters())
         association = torch.stack([own[0].get(name, none) for name in ASSOCIATION_WEIGHTS])
@@ -106,11 +106,11 @@ class JointScanCRF(nn.Module):
 
     @property
     def fitted(self) -> Parameters:
-        """All that was learned, as the inference functions take it."""
+        """All fitted quantities, as the inference functions take them."""
         return Parameters(*self.weight_vectors, self.scales, self.boosters, self.calibration, self.cluster_potential)
 
     def view(self, batch: ScanPairBatch, learned: LearnedInputs | None = None) -> PairView:
-        """What the features need of a batch, computed once. learned: what `learned_inputs` made of a larger network's say."""
+        """The batch prepared for the features, computed once. learned: output of `learned_inputs`."""
         return PairView.of(batch, self.config.features.wrap_closed, self.config.features.length_unit, learned)
 
     def learned_inputs(
@@ -122,9 +122,9 @@ class JointScanCRF(nn.Module):
         target_embedding: Tensor | None = None,
         extra_log_unary: ExtraLogUnary | None = None,
     ) -> LearnedInputs | None:
-        """The optional inputs of `forward`, checked, with the output of the encoder; None where there are none.
+        """The optional inputs of `forward`, checked and combined with the output of the encoder; None if there are none.
 
-        start: motions under which the encoder sees the batch; None: without the encoder.
+        start: motions under which the encoder aligns the batch; None: the encoder is not applied.
         """
         extra, embeddings = extra_log_unary or ExtraLogUnary(), (source_embedding, target_embedding)
         if self.encoder is not None and start is not None:
@@ -139,7 +139,7 @@ class JointScanCRF(nn.Module):
     def _with_encoder(
         self, encoder: ScanEncoder, batch: ScanPairBatch, start: Start, extra: ExtraLogUnary, embeddings: BothEmbeddings
     ) -> tuple[ExtraLogUnary, BothEmbeddings]:
-        """The inputs with the output of the encoder."""
+        """The optional inputs combined with the output of the encoder."""
         encoded = encoder(batch, start, self.config.inference.backend)
         if encoded.source_embedding is None:
             return extra.plus(encoded.extra), embeddings
@@ -160,12 +160,12 @@ class JointScanCRF(nn.Module):
         return Embeddings.of(source, target, (batch.source_mask, batch.target_mask), kind, weights)
 
     def initialise(self, batch: ScanPairBatch) -> Start:
-        """InitialiseRT: the motions to begin with (Algorithm 1, line 1). No gradient."""
+        """InitialiseRT: initial motions of the batch (Algorithm 1, line 1). No gradient."""
         found = initialise(batch, score_of(self.hypothesis_score), self.config.motions)
         begin = BEGINNINGS.get(self.config.start)
         if begin is None:
             return found
-        with torch.autocast(batch.source.device.type, enabled=False):  # a few centimetres decide which movers there are
+        with torch.autocast(batch.source.device.type, enabled=False):  # centimetres decide which movers are found
             view = self.view(batch)
             return begin(view, found.scaled(view.factor), self.fitted, self.config.inference).scaled(1 / view.factor)
 
@@ -182,9 +182,9 @@ class JointScanCRF(nn.Module):
 
         Args:
             batch: B pairs.
-            start: motions to begin with; looked for where absent. For `ClusteringCRF` its association is the fixed one.
-            source_embedding, target_embedding: (B, N, C), (B, M, C) of the points, for a model with `features.embedding`: alike
-                ones are associated. The start is looked for without them. None: as if the model knew none.
+            start: initial motions; None: from InitialiseRT. For `ClusteringCRF` its association is the fixed one.
+            source_embedding, target_embedding: (B, N, C), (B, M, C) of the points, for a model with `features.embedding`: similar
+                ones are associated. InitialiseRT does not use them. None: the term is left out.
             extra_log_unary: (B, N) learned log potentials of outliers and of moving points.
         """
         start = start or self.initialise(batch)  # InitialiseRT
@@ -192,10 +192,10 @@ class JointScanCRF(nn.Module):
             batch, start, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
         )
         rounds = self._in_loops if self._suits_loops(batch, learned) else self._in_tensors  # the engine
-        return rounds(batch, start, learned)  # potentials, messages, motions, again until they settle
+        return rounds(batch, start, learned)  # potentials, messages, motions, repeated until convergence
 
     def _suits_loops(self, batch: ScanPairBatch, learned: LearnedInputs | None) -> bool:
-        """Whether the loops answer: on a CPU, for settings that they know, where there is no gradient to follow."""
+        """Whether the loops can compute the rounds: on a CPU, for supported settings, without a gradient."""
         extra = () if learned is None else (learned.outlier, learned.moving)
         tensors = (*self.parameters(), batch.source, batch.target, batch.initial_motion, *extra)
         needs_gradient = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
@@ -203,11 +203,11 @@ class JointScanCRF(nn.Module):
         return can_decode(self.config, batch.source.device, needs_gradient=needs_gradient, has_embeddings=has_embeddings)
 
     def _in_loops(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
-        """The rounds in machine code, one pair a thread, without a gradient."""
+        """The rounds in machine code, one pair per thread, without a gradient."""
         return predict(batch, start, fitted_of(self.fitted), settings_of(self.config), learned)
 
     def _in_tensors(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
-        """The same in tensors, all pairs at once, with a gradient where the schedule has one."""
+        """The rounds in tensors, all pairs at once, with a gradient if the schedule supports it."""
         view = self.view(batch, learned)  # features, in their unit of length
         decode = DECODERS[self.config.inference.schedule]
         found = decode(view, start.scaled(view.factor), self.fitted, self.config)
@@ -216,7 +216,8 @@ class JointScanCRF(nn.Module):
     def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
         """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.
 
-        plugins: motions and labels taken as observed in the features, in the unit of `view`; the true ones where absent.
+        Args:
+            plugins: motions and labels taken as observed in the features, in the unit of `view`; None: the annotated ones.
         """
         if batch.truth is None:
             raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
@@ -230,24 +231,25 @@ class JointScanCRF(nn.Module):
     def match(
         self, source: Scan, target: Scan, dt: float = 0.1, *, initial_motion: Sequence[float] | None = None
     ) -> PairPrediction:
-        """One pair, by beam: what became of every beam of `source`, which move together, and how.
+        """Association, cluster and motions of one pair, by beam of `source`.
 
-        initial_motion: a guess (theta, tx, ty) of the background's motion, e.g. from odometry; one more start, never
-                trusted blindly.
+        Args:
+            initial_motion: a guess (theta, tx, ty) of the background's motion, e.g. from odometry; used as one more initial
+                hypothesis, never taken unchecked.
         """
         pair = ScanPair(source, target, dt, initial_motion=None if initial_motion is None else np.asarray(initial_motion))
         return self.match_pairs([pair])[0]
 
     @torch.no_grad()
     def match_pairs(self, pairs: Sequence[ScanPair], batch_size: int = 16) -> list[PairPrediction]:
-        """Many pairs, in batches."""
+        """Predictions of many pairs, in batches of `batch_size`."""
         found: list[PairPrediction] = []
         for begin in range(0, len(pairs), batch_size):
             found += self._match(pairs[begin : begin + batch_size])
         return found
 
     def _match(self, pairs: Sequence[ScanPair]) -> list[PairPrediction]:
-        """The answers for one batch of pairs: in arrays all the way where the loops answer, in padded tensors elsewhere."""
+        """Predictions of one batch of pairs: in arrays throughout where the loops compute the rounds, else in padded tensors."""
         reference = self.association_weights["sequence"]
         has_embeddings = self.config.encoder.embedding > 0
         if not (STARTS[self.config.start].in_loops and can_decode(self.config, reference.device, has_embeddings=has_embeddings)):
@@ -269,12 +271,12 @@ class JointScanCRF(nn.Module):
     def from_pretrained(
         cls, name_or_path: str | Path = PRETRAINED, *, features: dict[str, Any] | None = None, **inference: Any
     ) -> JointScanCRF:
-        """A model from a folder written by `save_pretrained`, or one that the package ships, by name.
+        """Loads a model from a folder written by `save_pretrained`, or a model shipped with the package, by name.
 
         Args:
             name_or_path: a folder, or a name under `torchcrf_scan/weights`.
-            features: `smooth`, `learn_stumps` or `embedding` of `FeatureConfig` to change; weights that the saved model has not
-                begin as in a new one.
+            features: `smooth`, `learn_stumps` or `embedding` of `FeatureConfig` to change; weights missing in the saved model
+                are initialised as in a new one.
             inference: fields of `InferenceConfig` to change, e.g. `candidates=0`, `backend="eager"`.
 
         Raises:
@@ -287,12 +289,12 @@ class JointScanCRF(nn.Module):
 
     @property
     def embedding_state(self) -> dict[str, Tensor]:
-        """The part of the model's state that another without embeddings has not."""
+        """The part of the model's state that exists only with embeddings."""
         return {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in EMBEDDING_WEIGHTS}
 
 
 def check_inputs(batch: ScanPairBatch, extra: ExtraLogUnary, embeddings: BothEmbeddings) -> None:
-    """Raises ValueError where an optional input of `forward` has another shape than the batch."""
+    """Raises ValueError if an optional input of `forward` does not match the batch in shape."""
     given = {"source_embedding": embeddings[0], "target_embedding": embeddings[1]}
     given |= {"extra_log_unary.outlier": extra.outlier, "extra_log_unary.moving": extra.moving}
     for name, value in given.items():
@@ -310,7 +312,7 @@ class MatchingCRF(JointScanCRF):
 
 
 class ClusteringCRF(JointScanCRF):
-    """The clustering chain alone, 12 weights, on associations that come with the start and stay: CRF-Clustering."""
+    """The clustering chain alone, 12 weights, on the fixed associations of the start: CRF-Clustering."""
 
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__(replace(config or ModelConfig(), chains="clustering", coupling="motions"))

@@ -1,21 +1,21 @@
-"""Names of the features' weights, in the order in which tensors hold them; counts and slices follow from the names."""
+"""Names of the weights in the order of the tensors that hold them; counts and slices follow from the names."""
 
 from __future__ import annotations
 
 DISTANCES, ANGLES, GEODESICS = ("dist1", "dist3", "dist5"), ("angle1", "angle3", "angle5"), ("geo1", "geo3", "geo5")
-SHAPE = (*DISTANCES, *ANGLES, *GEODESICS)  # L1..L9, the same however scans move
-STATIC = (*SHAPE, "radius", "translation")  # L1..L11, whatever the motions
+SHAPE = (*DISTANCES, *ANGLES, *GEODESICS)  # L1..L9, invariant to motions of either scan
+STATIC = (*SHAPE, "radius", "translation")  # L1..L11, independent of the estimated motions
 LOCAL_CHANNELS = (*STATIC, "registered_translation")  # L1..L12
 SHAPE_CHANNELS, STATIC_CHANNELS = len(SHAPE), len(STATIC)
 
 BOOSTING = ("data_boosting", "outlier_boosting")
-ASSOCIATION_DECISIONS = ("excess", "gate", "outlier_bias")  # extensions: the nearest point or another, and how far is too far
+ASSOCIATION_DECISIONS = ("excess", "gate", "outlier_bias")  # extensions: nearest or another point, distance limit
 CLUSTERING_DECISIONS = ("gate", "outlier_bias")
 ASSOCIATION_FREE_SPACE = ("outlier_seen_through", "outlier_hidden")
 CLUSTERING_FREE_SPACE = ("seen_through", "seen_through_back", "hidden", "hidden_back", "outlier_seen_through", "outlier_hidden")
 
 ASSOCIATION_NODE = (*LOCAL_CHANNELS, *BOOSTING, *ASSOCIATION_DECISIONS, *ASSOCIATION_FREE_SPACE)
-SCALED_EDGES = ("pairwise_distance", "pairwise_translation")  # those with a scale
+SCALED_EDGES = ("pairwise_distance", "pairwise_translation")  # those that have a scale
 ASSOCIATION_EDGE = ("sequence", "pairwise_outlier", *SCALED_EDGES)
 ASSOCIATION_WEIGHTS = (*ASSOCIATION_NODE, *ASSOCIATION_EDGE)  # a01..a14, the extensions, a15..a18
 
@@ -28,7 +28,7 @@ CLUSTERING_EDGE = (
 )
 CLUSTERING_WEIGHTS = (*CLUSTERING_NODE, *CLUSTERING_EDGE)  # c01..c04, the extensions, c05..c12
 
-ASSOCIATION_UNARY, CLUSTERING_UNARY = len(ASSOCIATION_NODE), len(CLUSTERING_NODE)  # a node's; the rest are an edge's
+ASSOCIATION_UNARY, CLUSTERING_UNARY = len(ASSOCIATION_NODE), len(CLUSTERING_NODE)  # weights of nodes; the rest are those of edges
 FREE_SPACE_WEIGHTS = (
     *(f"association.{name}" for name in ASSOCIATION_FREE_SPACE),
     *(f"clustering.{name}" for name in CLUSTERING_FREE_SPACE),

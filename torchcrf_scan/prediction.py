@@ -1,4 +1,4 @@
-"""What the model says: of a batch, as padded tensors, and of one pair, by beam."""
+"""Output of the model: of a batch, as padded tensors, and of one pair, by beam."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ from torchcrf_scan.batch import scale_motions
 from torchcrf_scan.scan import Floats, Ints, PairPrediction, ScanPair
 from torchcrf_scan.tree import tensor_tree
 
-LEAST_SHARE = 0.02  # of the best possible information per point; in a direction with less the motion counts as not observed
+LEAST_SHARE = 0.02  # of the largest possible information per point; below it a direction of the motion counts as unobserved
 
 
 @tensor_tree
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """How well the motions of a batch are known.
+    """Uncertainty of the motions of a batch.
 
-    A small motion away from cluster c's own is (theta L, x, y): a turn about the centroid of its moved points, times their root
-    mean square distance L from it, then a shift in the target frame; all in metres. `directions` are given in these.
+    A small deviation from the motion of cluster c is (theta L, x, y): a rotation about the centroid of its moved points, times
+    their root mean square distance L from it, then a translation in the target frame; all in metres. `directions` are given in
+    these coordinates.
 
     Attributes:
         covariance: (B, C, 3, 3) of (theta, tx, ty), radians and metres; large but finite where nothing is observed.
-        information: (B, C, 3) ascending, what a point says of each of the `directions`, 1 = as much as a point can say of a shift.
-            No gradient.
+        information: (B, C, 3) ascending, information per point about each of the `directions`; 1 = the most that a point can give
+            about a translation. No gradient.
         directions: (B, C, 3, 3), row d is the unit direction of information[..., d]. No gradient.
     """
 
@@ -42,14 +43,14 @@ class Uncertainty:
 
     @property
     def is_turn_unobserved(self) -> Tensor:
-        """(B, C) bool, whether nothing is known of the rotation: no points, one point, a pole, a tube seen from its middle."""
+        """(B, C) bool, whether the rotation is unobserved: no points, one point, a pole, a tube seen from its middle."""
         return self._unobserved[..., 0, 0] > 0.5
 
     @property
     def unobserved_shift(self) -> Tensor:
-        """(B, C, 2) unit vector, in the target frame, along which the cluster may have slid unseen (a corridor's, a car's side).
+        """(B, C, 2) unit vector, in the target frame, of the unobserved translation (along a corridor, along a car's side).
 
-        0 where there is none; where no shift is observed at all, any of the directions.
+        0 where there is none; if no translation is observed at all, an arbitrary one of the directions.
         """
         values, vectors = torch.linalg.eigh(self._unobserved[..., 1:, 1:])
         return vectors[..., -1] * (values[..., -1:] > 0.5)
@@ -61,16 +62,16 @@ class Uncertainty:
         return rows.mT @ rows
 
     def scaled(self, factor: Tensor) -> Uncertainty:
-        """The same in another unit of length, a factor (B,) a pair."""
+        """The same in another unit of length; factor: (B,) scale of each pair."""
         unit = torch.stack([torch.ones_like(factor), factor, factor], -1)[:, None]  # (B, 1, 3)
         return replace(self, covariance=self.covariance * unit[..., None] * unit[..., None, :])
 
     def inflated(self, factor: Tensor) -> Uncertainty:
-        """All covariances times a factor ()."""
+        """The same with all covariances multiplied by factor: ()."""
         return replace(self, covariance=self.covariance * factor)
 
     def of_pair(self, b: int) -> Uncertainty:
-        """That of pair b alone, without gradient, on the CPU."""
+        """The uncertainty of pair b alone, without gradient, on the CPU."""
         row = slice(b, b + 1)
         return Uncertainty(*(values[row].detach().cpu() for values in (self.covariance, self.information, self.directions)))
 
@@ -78,26 +79,26 @@ class Uncertainty:
 @tensor_tree
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """What the model says of a batch; tensors of points, batch first. The README tells what every output's gradient is and costs.
+    """Output of the model for a batch; tensors by point, batch first. The README lists the gradient of every output and its cost.
 
-    Whole numbers and booleans have no gradient, and nothing has where compiled code answered or by the `flooding` schedule.
+    Integers and booleans have no gradient; no output has one if the loops (backend `compiled`) or the schedule `flooding` ran.
 
     Attributes:
         association: (B, N) int64 target point, -1 outlier.
         cluster: (B, N) int64 0 background, 1..D-2 movers, -1 outlier.
-        motions: (B, D-1, 3) `T_target_source` of background and movers. Gradients reach what was learned only if
+        motions: (B, D-1, 3) `T_target_source` of background and movers. Gradients reach learned parameters only if
             `motion_weights` is soft; with hard ones they reach the points alone and, point-to-line, the start's motions.
         active: (B, D-1) bool, the clusters that exist. The others' motions are those of the start or of their last points.
-        candidates: (B, N, K) int64 target point that every inlier association state stands for.
+        candidates: (B, N, K) int64 target point of every inlier association state.
         log_association: (B, N, K+1) normalised log-beliefs of the association chain, last = outlier; uniform in the padding.
-            Differentiable at the candidates that there are; kinks where labellings tie, but only at temperature 0.
-        log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier; likewise.
-        converged: (B,) bool, whether labels and motions had settled.
-        iterations: (B,) int64 rounds done.
-        association_confidence: (B, N) in [0, 1], to be right within two target points; calibrated. None: the beliefs themselves.
-            Gradient of the beliefs, at the label as it is.
+            Differentiable at fixed candidates; kinks where labellings tie, but only at temperature 0.
+        log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier; gradient likewise.
+        converged: (B,) bool, whether labels and motions had converged.
+        iterations: (B,) int64 number of rounds.
+        association_confidence: (B, N) in [0, 1], calibrated probability that the association is within two target points of the
+            true one. None: the beliefs themselves. Gradient of the beliefs, at fixed labels.
         cluster_confidence: (B, N) in [0, 1], calibrated. None: the beliefs themselves. Gradient likewise.
-        uncertainty: covariances of the motions and what of them was not observed; None for methods that do not say. Of these only
+        uncertainty: covariances and unobserved directions of the motions; None for methods that do not provide them. Of these
             the covariances have a gradient.
     """
 
@@ -115,12 +116,12 @@ class Prediction:
     uncertainty: Uncertainty | None = None
 
     def scaled(self, factor: Tensor) -> Prediction:
-        """The same in another unit of length, a factor (B,) a pair."""
+        """The same in another unit of length; factor: (B,) scale of each pair."""
         uncertainty = self.uncertainty and self.uncertainty.scaled(factor)
         return replace(self, motions=scale_motions(self.motions, factor), uncertainty=uncertainty)
 
     def pair(self, b: int, pair: ScanPair) -> PairPrediction:
-        """Pair b by beam, its movers numbered 1.. by falling size, the vacuous ones left out."""
+        """Prediction of pair b by beam, its movers numbered 1.. by falling size, without the vacuous ones."""
         n = len(pair.source)
         given = (self.association_confidence, self.log_association), (self.cluster_confidence, self.log_cluster)
         confidences = [(log.exp().amax(-1) if sure is None else sure)[b, :n].detach().cpu().double().numpy() for sure, log in given]
@@ -144,15 +145,15 @@ def pair_prediction(
     converged: bool,
     uncertainty: Uncertainty | None,
 ) -> PairPrediction:
-    """The answer for one pair by beam, its movers numbered 1.. by falling size, the vacuous ones left out.
+    """The prediction of one pair by beam, its movers numbered 1.. by falling size, without the vacuous ones.
 
     Args:
         association: (N,) target point, cluster: (N,); -1 outlier. motions: (C, 3). confidences: (N,) of both.
-        uncertainty: of one pair, on the CPU; None: nothing is said of it.
+        uncertainty: of one pair, on the CPU; None: not provided.
     """
     sizes = np.bincount(cluster[cluster > 0], minlength=len(motions))
     movers = [k for k in np.argsort(-sizes, kind="stable") if k > 0 and sizes[k] > 0]
-    number = np.full(len(motions) + 1, -1)  # the last entry keeps -1 at -1
+    number = np.full(len(motions) + 1, -1)  # the last entry maps -1 to -1
     number[[0, *movers]] = np.arange(len(movers) + 1)
     beam_of_point = np.append(pair.target.beam, -1)
     rows = [0, *movers]

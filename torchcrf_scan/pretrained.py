@@ -1,4 +1,4 @@
-"""Saved models: a folder of `config.json` and `model.safetensors`, or a name of those that the package ships."""
+"""Saved models: a folder of `config.json` and `model.safetensors`, or the name of a model shipped with the package."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from torchcrf_scan.whole_file import write_whole
 
 PRETRAINED = "simulated"
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
-PADDED = "thresholds"  # the last part of the names of tensors that are padded with infinity
+PADDED = "thresholds"  # suffix of the names of tensors that are padded with infinity
 
 
 def find_weights(name_or_path: str | Path) -> Path:
-    """The folder of a saved model: a path, or the name of one that the package ships."""
+    """The folder of a saved model, from a path or the name of a shipped model."""
     path = Path(name_or_path)
     if (path / CONFIG).is_file():
         return path
@@ -37,7 +37,7 @@ def find_weights(name_or_path: str | Path) -> Path:
 
 
 def write_model(folder: Path, config: ModelConfig, state: Mapping[str, Tensor]) -> None:
-    """Writes a model, each file whole or not at all; what is run-time only (`config.RUN_TIME`) is not written."""
+    """Writes a model, each file atomically; run-time settings (`config.RUN_TIME`) are not written."""
     from safetensors.torch import save
 
     values = asdict(config)
@@ -52,7 +52,7 @@ def read_config(folder: Path, features: Mapping[str, Any], inference: Mapping[st
     """The config of a saved model with some fields changed.
 
     Raises:
-        ValueError: a file that is no config, or a value that is refused.
+        ValueError: a file that is not a valid config, or a value that is out of bounds.
     """
     path = folder / CONFIG
     try:
@@ -63,18 +63,18 @@ def read_config(folder: Path, features: Mapping[str, Any], inference: Mapping[st
 
 
 def model_config(values: Any) -> ModelConfig:
-    """The config that `asdict` made into a dictionary, with the defaults of the time when there was less to say."""
+    """The config from its dictionary (`asdict`); settings missing in older models take the defaults of their time."""
     if isinstance(values, dict):
         values = {name: dict(of) if isinstance(of, dict) else of for name, of in values.items()}
         if isinstance(values.get("inference"), dict):
             _drop_run_time(values["inference"])
         if isinstance(values.get("features"), dict):
-            values["features"].setdefault("left_out", ())  # models that are older than this setting have every feature
+            values["features"].setdefault("left_out", ())  # models saved before this setting existed have every feature
     return from_values(ModelConfig, values, "model")
 
 
 def _drop_run_time(inference: dict[str, Any]) -> None:
-    """Takes out what was once saved with the weights; a value that is not the default is told."""
+    """Removes run-time settings that older versions saved with the weights; warns about values other than the default."""
     defaults = {field.name: field.default for field in fields(InferenceConfig)}
     for name in RUN_TIME:
         value = inference.pop(name, defaults[name])
@@ -84,10 +84,10 @@ def _drop_run_time(inference: dict[str, Any]) -> None:
 
 
 def load_state(model: nn.Module, folder: Path, fresh: Mapping[str, Tensor]) -> None:
-    """Takes over the saved tensors; those of `fresh` that were not saved stay as they are.
+    """Loads the saved tensors into a model; those missing in the file are taken from `fresh`.
 
     Raises:
-        ValueError: a file that is none, one of another model, or numbers that are not finite.
+        ValueError: a damaged file, one of another model, or numbers that are not finite.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load

@@ -1,10 +1,10 @@
-"""The data that passes through the package: scans, annotated pairs and predictions of one pair.
+"""Scans, annotated pairs and predictions of one pair.
 
 Frame: x ahead, y left, bearings counter-clockwise, metres, radians, seconds. The first scan of a pair is the `source`, the
 second the `target`; a motion `T_target_source` = (theta, tx, ty) maps source points into the target frame.
 
-Two numberings live side by side. A *beam* is an entry of the arrays that came in, valid or not; a *point* is a valid return.
-Annotations and `PairPrediction` count beams (they are what files hold), tensors count points; `Scan.beam` leads to beams.
+There are two numberings. A *beam* is an entry of the input arrays, valid or not; a *point* is a valid return.
+Annotations and `PairPrediction` count beams (as files do), tensors count points; `Scan.beam` maps points to beams.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ Bools = NDArray[np.bool_]
 
 BACKGROUND = 0
 OUTLIER = -1
-MAX_RANGE_MARGIN = 0.05  # spec 0.2: a return this close to range_max is a beam that hit nothing
-FARTHEST = 1e6  # metres; what a sensor calls farther is no return, and its square would leave single precision
-CLOSED_SPAN = float(np.radians(315.0))  # a scan that sees this much of the circle has neighbours across +-180 deg (A-06)
+MAX_RANGE_MARGIN = 0.05  # spec 0.2: a range this close to range_max is a beam without return
+FARTHEST = 1e6  # metres; larger ranges are treated as invalid, as their squares would lose single precision
+CLOSED_SPAN = float(np.radians(315.0))  # a scan that spans at least this much has neighbours across +-180 deg (A-06)
 
 
 def _vector(name: str, values: ArrayLike, length: int | None = None) -> Floats:
@@ -35,7 +35,7 @@ def _vector(name: str, values: ArrayLike, length: int | None = None) -> Floats:
 
 
 def check_sensor(range_min: float | None, range_max: float | None, range_noise: float | None) -> None:
-    """Raises ValueError where what is told of a sensor cannot be: not a number, nothing between its limits, a senseless noise."""
+    """Raises ValueError for impossible sensor limits: not a number, an empty interval, or noise out of bounds."""
     least = 0.0 if range_min is None else range_min
     if not np.isfinite(least):
         raise ValueError(f"range_min: expected a finite number of metres, got {range_min}")
@@ -52,7 +52,7 @@ class Scan:
     Attributes:
         ranges: (N,) metres.
         bearings: (N,) radians, counter-clockwise, non-decreasing.
-        beam: (N,) index of every return in the arrays that came in.
+        beam: (N,) index of every return in the input arrays.
         n_beams: length of those arrays.
         range_min, range_max, range_noise: metres, None when unknown.
     """
@@ -77,13 +77,13 @@ class Scan:
         range_max: float | None = None,
         range_noise: float | None = None,
     ) -> Scan:
-        """Makes a scan from ranges and bearings, or from ranges, `angle_min` and `angle_increment`.
+        """A scan from ranges and bearings, or from ranges, `angle_min` and `angle_increment`.
 
-        Invalid returns (not finite, not above max(range_min, 0), not below range_max - 0.05 m nor `FARTHEST`) are dropped. A
-        range_max of infinity is no limit.
+        Invalid returns (not finite, not above max(range_min, 0), not below range_max - 0.05 m or `FARTHEST`) are dropped. An
+        infinite range_max is no limit.
 
         Raises:
-            ValueError: wrong shapes, neither or both forms of bearings, bearings not finite or decreasing, a sensor that cannot be.
+            ValueError: wrong shapes, neither or both forms of bearings, bearings not finite or decreasing, impossible limits.
         """
         ranges = _vector("ranges", ranges)
         check_sensor(range_min, range_max, range_noise)
@@ -131,14 +131,14 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Annotation:
-    """What became of every source beam (`n` = source.n_beams); the pair file's optional keys.
+    """Ground truth of every source beam (`n` = source.n_beams); the optional keys of a pair file.
 
     Attributes:
         association: (n,) target beam, -1 outlier (no counterpart).
         cluster: (n,) 0 background, k >= 1 moving object k, -1 exactly where association is -1.
         motions: (K+1, 3) `T_target_source` of every cluster; a NaN row where the object is not in this pair.
-        body: (n,) what the beam belongs to even without a counterpart, -1 unknown.
-        ignore: (n,) bool, beams that nobody annotated.
+        body: (n,) cluster of the object hit by the beam, also without a counterpart; -1 unknown.
+        ignore: (n,) bool, unannotated beams.
     """
 
     association: Ints
@@ -169,18 +169,18 @@ class ScanPair:
 
 @dataclass(frozen=True, slots=True)
 class PairPrediction:
-    """The answer for one pair, by source beam: exactly the contents of a prediction file. Arrays, without gradient.
+    """Prediction of one pair, by source beam: exactly the contents of a prediction file. Arrays, without gradient.
 
     Attributes:
         association: (n,) int64 target beam, -1 outlier.
         cluster: (n,) int64 0 background, k >= 1 mover k, -1 outlier.
         motions: (K+1, 3) `T_target_source` of background and movers; the sensor moved by the inverse of row 0.
         association_confidence, cluster_confidence: (n,) in [0, 1].
-        converged: whether the labels had settled when the iterations ended.
+        converged: whether the labels had converged when the iterations ended.
         covariances: (K+1, 3, 3) of the motions' (theta, tx, ty), radians and metres; large where nothing was observed.
-        unobserved_turn: (K+1,) bool, nothing is known of the rotation.
-        unobserved_shift: (K+1, 2) unit direction, in the target frame, along which the cluster may have slid unseen; 0: none.
-            These three are None where the method does not say.
+        unobserved_turn: (K+1,) bool, the rotation is unobserved.
+        unobserved_shift: (K+1, 2) unit direction, in the target frame, of the cluster's unobserved translation; 0: none.
+            These three are None for methods that do not provide them.
     """
 
     association: Ints

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: written beside their place, flushed to the disk, moved there."""
+"""Atomic writing of files: to a temporary file in the same folder, flushed to the disk, then renamed."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Replaces a file by new content in one step that a killed process or a full disk cannot leave half done.
+    """Replaces a file by new content atomically: a killed process or a full disk cannot leave it incomplete.
 
     Raises:
-        OSError: it could not be written; the file that was there still is.
+        OSError: the file could not be written; its old content is kept.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -24,6 +24,6 @@ def write_whole(path: Path, content: bytes | str) -> None:
         raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
-        os.fsync(folder)  # the new name too, not the content alone
+        os.fsync(folder)  # makes the rename durable, not only the content
     finally:
         os.close(folder)

@@ -1,1 +1,1 @@
-"""Simpler methods to compare with."""
+"""Simpler methods for comparison."""

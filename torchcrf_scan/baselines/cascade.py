@@ -1,4 +1,4 @@
-"""Separate reasoning: CRF-Matching first, then CRF-Clustering on what it says, nothing fed back (spec 9.2, 9.4)."""
+"""Separate reasoning: CRF-Matching first, then CRF-Clustering on its associations, without feedback (spec 9.2, 9.4)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchcrf_scan.variants.paper_start import movers_from_associations
 
 
 class Cascade:
-    """CRF-Clustering on the associations of CRF-Matching, nothing fed back (spec 9.4)."""
+    """CRF-Clustering on the associations of CRF-Matching, without feedback (spec 9.4)."""
 
     def __init__(self, matching: MatchingCRF, clustering: ClusteringCRF) -> None:
         self.matching, self.clustering = matching, clustering

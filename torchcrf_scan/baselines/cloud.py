@@ -1,4 +1,4 @@
-"""A scan as a plain cloud of points: neighbours, spacing and direction of the surface. Nothing of the field's own geometry."""
+"""A scan as a point cloud: neighbours, spacing and direction of the surface. Independent of the model's own geometry."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torchcrf_scan.geometry.kabsch import kabsch
 from torchcrf_scan.scan import Bools, Floats, Ints, Scan
 
-GRAZING = math.sin(math.radians(10.0))  # a surface met at a flatter angle counts as a depth jump
+GRAZING = math.sin(math.radians(10.0))  # a larger angle of incidence counts as a depth jump
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class Cloud:
     Attributes:
         points: (N, 2) metres, in beam order.
         ranges: (N,) metres.
-        spacing: (N,) metres to the nearest other return, at least what a beam step covers, at most that at grazing incidence.
+        spacing: (N,) metres to the nearest other return, bounded by the footprint of a beam step at normal and grazing incidence.
         tangent: (N, 2) unit vector along the surface, 0 for a point without neighbours on it.
         step: radians between beams, the median.
         tree: the points in a k-d tree.
@@ -54,26 +54,26 @@ class Cloud:
         return self.tree.query(points)
 
     def hides(self, points: Floats, slack: Floats) -> Bools:
-        """(N,) whether points (N, 2), seen from this scan, lie behind what its beams hit, or where no beam returned.
+        """(N,) whether points (N, 2) are occluded in this scan: behind the returns of its beams, or where no beam returned.
 
         slack: (N,) metres by which they must lie behind all the nearest beams.
         """
         ranges = np.linalg.norm(points, axis=-1)
-        beams = cKDTree(self.points / self.ranges[:, None])  # on the unit circle, so a full circle needs no care
+        beams = cKDTree(self.points / self.ranges[:, None])  # on the unit circle, so a full circle needs no special case
         ahead = points / np.maximum(ranges, 1e-9)[:, None]
         apart, index = beams.query(ahead, k=range(1, 1 + min(3, len(self))))  # (N, 3)
         return (apart[:, 0] > 1.5 * self.step) | (ranges - slack > self.ranges[index].max(-1))
 
 
 def fit_motion(source: Floats, target: Floats, weights: Floats | None = None) -> Floats:
-    """(..., 3) least-squares rigid motions. source, target: (..., P, 2) paired points; weights: (..., P), 1 when left out."""
+    """(..., 3) least-squares rigid motions. source, target: (..., P, 2) paired points; weights: (..., P), default 1."""
     weights = np.ones(source.shape[:-1]) if weights is None else weights
     return kabsch(*(torch.tensor(array) for array in (source, target, weights))).numpy()
 
 
 def _tangents(points: Floats, reach: Floats, is_closed: bool) -> Floats:
-    """(N, 2) direction from the previous to the next point, of which only those within reach count. reach: (N,) metres."""
-    following = np.roll(points, -1, axis=0) - points  # (N, 2), the last one leads round
+    """(N, 2) direction from the previous to the next point, using only those within reach. reach: (N,) metres."""
+    following = np.roll(points, -1, axis=0) - points  # (N, 2), the last one wraps round
     is_joined = np.linalg.norm(following, axis=1) <= np.minimum(reach, np.roll(reach, -1))
     is_joined[-1] &= is_closed
     arm = following * is_joined[:, None]

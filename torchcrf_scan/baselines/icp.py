@@ -13,8 +13,8 @@ from torchcrf_scan.baselines.trimmed_icp import register_trimmed
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import OUTLIER, Floats, Ints, PairPrediction, ScanPair
 
-FOUND = 0.346  # share of points that the paper's ICP calls outliers; its rejection rule is not given
-GATES = (*(round(0.03 * 1.35**k, 4) for k in range(18)), math.inf)  # metres, to choose from; the last keeps the rule alone
+FOUND = 0.346  # share of outliers of the paper's ICP; its rejection rule is not given
+GATES = (*(round(0.03 * 1.35**k, 4) for k in range(18)), math.inf)  # metres, to choose from; with the last only reciprocity rejects
 LOOSE_GATE = 0.5  # metres
 DEVIATIONS = 2.5
 ROUNDS = 50
@@ -22,12 +22,12 @@ ROTATION_TOLERANCE, TRANSLATION_TOLERANCE = 1e-4, 1e-3  # radians, metres
 
 
 def match_icp(pair: ScanPair, *, gate: float | None = None, initial_motion: Floats | None = None) -> PairPrediction:
-    """Background everywhere but for the rejected points, which are outliers.
+    """Background everywhere except for the rejected points, which are outliers.
 
     Args:
         pair: two scans.
-        gate: metres that a counterpart may be away; None: the larger of 0.5 m and 2.5 median absolute deviations.
-        initial_motion: (3,) `T_target_source` to begin with, the identity when left out.
+        gate: maximum distance to a counterpart, metres; None: the larger of 0.5 m and 2.5 median absolute deviations.
+        initial_motion: (3,) initial `T_target_source`; None: the identity.
     """
     motion = IDENTITY if initial_motion is None else np.asarray(initial_motion, dtype=np.float64)
     if not len(pair.source) or not len(pair.target):
@@ -37,7 +37,7 @@ def match_icp(pair: ScanPair, *, gate: float | None = None, initial_motion: Floa
     for _ in range(ROUNDS):
         association = associate(source, target, motion, gate)
         kept = association >= 0
-        if np.count_nonzero(kept) < 2:  # says nothing of the rotation
+        if np.count_nonzero(kept) < 2:  # the rotation would be undetermined
             break
         previous, motion = motion, fit_motion(source.points[kept], target.points[association[kept]])
         rotation, translation = se2.distance(motion, previous)
@@ -48,7 +48,7 @@ def match_icp(pair: ScanPair, *, gate: float | None = None, initial_motion: Floa
 
 
 def associate(source: Cloud, target: Cloud, motion: Floats, gate: float | None) -> Ints:
-    """(N,) nearest target point where that one's nearest is the point itself and the gate holds, else -1. One to one."""
+    """(N,) nearest target point if the point is also that one's nearest and within the gate, else -1. One to one."""
     distance, nearest = target.nearest(se2.apply(motion, source.points))
     home = source.nearest(se2.apply(se2.inverse(motion), target.points))[1]  # (M,)
     is_mutual = home[nearest] == np.arange(len(source))
@@ -64,7 +64,7 @@ def loose_gate(distance: Floats) -> float:
 
 
 def found_shares(pair: ScanPair, gates: Sequence[float] = GATES) -> Floats:
-    """(G,) share of the valid, annotated source points that ICP calls outliers at each gate; NaN without such points."""
+    """(G,) share of the valid, annotated source points that are outliers of ICP at each gate; NaN without such points."""
     counted = pair.source.to_beams(np.ones(len(pair.source), dtype=bool), False)
     if pair.annotation is not None:
         counted &= ~pair.annotation.ignore
@@ -74,12 +74,12 @@ def found_shares(pair: ScanPair, gates: Sequence[float] = GATES) -> Floats:
 
 
 def choose_gate(shares: Floats, gates: Sequence[float] = GATES) -> float:
-    """The gate (metres) whose mean share of outliers comes nearest the paper's 34.6 %, the first among equals.
+    """The gate (metres) whose mean share of outliers is closest to the paper's 34.6 %, the first among equals.
 
-    shares: (P, G) of `found_shares`; pairs of NaN say nothing. To be called with training pairs only.
+    shares: (P, G) of `found_shares`; pairs of NaN are skipped. To be called with training pairs only.
 
     Raises:
-        ValueError: shares of another shape, or no pair that says anything.
+        ValueError: shares of another shape, or NaN for all pairs.
     """
     shares = np.asarray(shares, dtype=np.float64)
     if shares.ndim != 2 or shares.shape[1] != len(gates):
@@ -91,7 +91,7 @@ def choose_gate(shares: Floats, gates: Sequence[float] = GATES) -> float:
 
 
 def match_background(pair: ScanPair) -> PairPrediction:
-    """The sanity row: every point is background under the trimmed ICP's motion and becomes its nearest target point."""
+    """Sanity baseline: every point is background under the trimmed ICP's motion and associated with its nearest target point."""
     if not len(pair.source) or not len(pair.target):
         return all_outliers(pair)
     source, target = Cloud.of(pair.source), Cloud.of(pair.target)

@@ -1,4 +1,4 @@
-"""K-Means on the displacements that another method's associations imply (spec 9.3)."""
+"""K-Means on the displacements implied by another method's associations (spec 9.3)."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def cluster_displacements(
 
     Args:
         pair: two scans.
-        matched: its associations, kept as they are.
-        clusters: K, groups at most (as many as there are different displacements).
-        remove_motion: measure displacements from where the background's motion of `matched` brings the points.
+        matched: its associations, kept unchanged.
+        clusters: K, maximum number of groups (at most the number of distinct displacements).
+        remove_motion: measure displacements relative to the background's motion of `matched`.
     """
     association = target_points(pair, matched)  # (N,)
     inliers = np.flatnonzero(association >= 0)
@@ -49,14 +49,14 @@ def group_by_size(displacements: Floats, clusters: int) -> Ints:
     """(P,) K-Means labels 0.. of (P, 2) displacements, numbered by falling size."""
     count = min(clusters, len(np.unique(displacements, axis=0)))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # displacements equal but for rounding: fewer groups, as it should be
+        warnings.simplefilter("ignore", ConvergenceWarning)  # displacements equal up to rounding give fewer groups, as intended
         found = KMeans(count, n_init=RESTARTS, random_state=SEED).fit(displacements).labels_
     order = np.argsort(-np.bincount(found, minlength=count), kind="stable")
     return np.argsort(order)[found]
 
 
 def fit_group(source: Floats, target: Floats, rotation: float) -> Floats:
-    """(3,) motion of (P, 2) paired points, P >= 1; few or crowded points take `rotation` (radians) and the mean shift."""
+    """(3,) motion of (P, 2) paired points, P >= 1; few or concentrated points take `rotation` (radians) and the mean shift."""
     spread = source - source.mean(0)
     extent = np.sqrt(np.linalg.eigvalsh(spread.T @ spread / len(source)).max())
     if len(source) >= FEWEST_POINTS and extent >= LEAST_EXTENT:

@@ -1,4 +1,4 @@
-"""From arrays of points to the prediction of a pair, which counts beams."""
+"""Conversion of labels by point to the prediction of a pair, by beam."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ def to_prediction(pair: ScanPair, association: Ints, cluster: Ints, motions: Flo
     """Numbers the movers by falling size, drops those without points, and scatters the labels to the beams.
 
     Args:
-        pair: what is predicted.
+        pair: the pair.
         association: (N,) target point, -1 outlier.
         cluster: (N,) row of `motions`, 0 background, -1 outlier.
         motions: (K+1, 3) `T_target_source`.
-        converged: whether the method had settled.
+        converged: whether the method had converged.
     """
     assert len(association) == len(cluster) == len(pair.source)
     sizes = np.bincount(cluster[cluster > BACKGROUND], minlength=len(motions))
     movers = [k for k in np.argsort(-sizes, kind="stable").tolist() if k != BACKGROUND and sizes[k] > 0]
-    number = np.full(len(motions) + 1, OUTLIER)  # the last entry keeps -1 at -1
+    number = np.full(len(motions) + 1, OUTLIER)  # the last entry maps -1 to -1
     number[[BACKGROUND, *movers]] = np.arange(1 + len(movers))
     beam = np.append(pair.target.beam, OUTLIER)
     confidence = pair.source.to_beams(np.ones(len(pair.source)), 0.0)
@@ -37,19 +37,19 @@ def to_prediction(pair: ScanPair, association: Ints, cluster: Ints, motions: Flo
 
 
 def target_points(pair: ScanPair, prediction: PairPrediction) -> Ints:
-    """(N,) target point of every source point, -1 outlier: the way back from beams."""
-    point_of_beam = np.full(pair.target.n_beams + 1, OUTLIER)  # the last entry keeps -1 at -1
+    """(N,) target point of every source point, -1 outlier: converts back from beams."""
+    point_of_beam = np.full(pair.target.n_beams + 1, OUTLIER)  # the last entry maps -1 to -1
     point_of_beam[pair.target.beam] = np.arange(len(pair.target))
     return point_of_beam[prediction.association[pair.source.beam]]
 
 
 def all_outliers(pair: ScanPair, motion: Floats = IDENTITY) -> PairPrediction:
-    """The answer where a scan is empty: nothing has a counterpart."""
+    """The prediction if a scan is empty: all points are outliers."""
     nothing = np.full(len(pair.source), OUTLIER)
     return to_prediction(pair, nothing, nothing, motion[None])
 
 
 def as_background(pair: ScanPair, association: Ints, motion: Floats, *, converged: bool = True) -> PairPrediction:
-    """Everything that has a counterpart is background. association: (N,) target point, -1 outlier; motion: (3,)."""
+    """All associated points are background. association: (N,) target point, -1 outlier; motion: (3,)."""
     cluster = np.where(association >= 0, BACKGROUND, OUTLIER)
     return to_prediction(pair, association, cluster, motion[None], converged=converged)

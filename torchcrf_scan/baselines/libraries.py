@@ -1,4 +1,4 @@
-"""Registration by other people's libraries, where they are installed (`pip install torchcrf-scan[bench]`)."""
+"""Registration by third-party libraries, if installed (`pip install torchcrf-scan[bench]`)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torchcrf_scan.baselines.labels import IDENTITY, all_outliers
 from torchcrf_scan.baselines.trimmed_icp import match_under
 from torchcrf_scan.scan import Floats, PairPrediction, Scan, ScanPair
 
-REACH = 1.0  # metres between corresponding points, small_gicp's default; Open3D has none
+REACH = 1.0  # metres between corresponding points, the default of small_gicp; Open3D has none
 FEWEST_POINTS = 3
 ITERATIONS = 50
 
 
 def register_small_gicp(pair: ScanPair, guess: Floats = IDENTITY) -> Floats:
-    """(3,) motion of small_gicp's ICP by one thread, clouds and tree made anew; its GICP needs normals, which no plane has."""
+    """(3,) motion of small_gicp's ICP in one thread, clouds and tree built anew; its GICP needs normals, undefined for a plane."""
     import small_gicp
 
     target, source = (small_gicp.PointCloud(_flat_cloud(scan)) for scan in (pair.target, pair.source))
@@ -25,7 +25,7 @@ def register_small_gicp(pair: ScanPair, guess: Floats = IDENTITY) -> Floats:
 
 
 def register_open3d(pair: ScanPair, guess: Floats = IDENTITY) -> Floats:
-    """(3,) motion of Open3D's point-to-point ICP; it chooses its threads itself."""
+    """(3,) motion of Open3D's point-to-point ICP, with its own choice of threads."""
     import open3d
 
     source, target = (
@@ -46,7 +46,7 @@ def match_open3d(pair: ScanPair) -> PairPrediction:
 
 
 def _match(pair: ScanPair, register: Callable[[ScanPair], Floats]) -> PairPrediction:
-    """Too few points to register stay where they are."""
+    """Registers a pair; with too few points the motion is the identity."""
     if not len(pair.source) or not len(pair.target):
         return all_outliers(pair)
     is_enough = min(len(pair.source), len(pair.target)) >= FEWEST_POINTS
@@ -54,7 +54,7 @@ def _match(pair: ScanPair, register: Callable[[ScanPair], Floats]) -> PairPredic
 
 
 def spatial_motion(motion: Floats) -> Floats:
-    """(4, 4) rigid transform about the vertical of a motion (3,) in the plane."""
+    """(4, 4) rigid transform about the vertical axis of a planar motion (3,)."""
     theta, x, y = motion
     transform = np.eye(4)
     transform[:2, :2] = [[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]]
@@ -63,7 +63,7 @@ def spatial_motion(motion: Floats) -> Floats:
 
 
 def planar_motion(transform: Floats) -> Floats:
-    """(3,) motion in the plane of a (4, 4) rigid transform about the vertical."""
+    """(3,) planar motion of a (4, 4) rigid transform about the vertical axis."""
     return np.array([np.arctan2(transform[1, 0], transform[0, 0]), transform[0, 3], transform[1, 3]])
 
 

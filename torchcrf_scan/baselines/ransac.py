@@ -1,4 +1,4 @@
-"""Trimmed ICP for the background, then sequential RANSAC for the movers: the strong classical rival."""
+"""Trimmed ICP for the background, then sequential RANSAC for the movers: a strong classical baseline."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import OUTLIER, Bools, Floats, Ints, PairPrediction, ScanPair
 
 SEED = 0
-OPEN_SHARE = 0.7  # of the gate: a larger residual is worth an explanation
-OCCLUDED_COST = 0.3  # of an ordinary miss: a point that went behind something needs no mover
+OPEN_SHARE = 0.7  # of the gate: points of larger residual are open, i.e. to be explained by a mover
+OCCLUDED_COST = 0.3  # relative to an ordinary miss: an occluded point needs no mover
 LARGEST_SPEED = 20.0  # metres per second over ground, and
 LARGEST_TRAVEL = 2.0  # ranges
 LARGEST_TURN = 0.5  # radians
 LINK = 3.0  # spacings between neighbouring points of one object
-WINDOW = 0.5  # of an object's seen extent: as far beyond it may still be the object
+WINDOW = 0.5  # of an object's visible extent: margin within which points may still belong to it
 MOST_PARTS = 10
 SAMPLES = 150
-REFINED = 8  # samples of a part worth a refinement, of
+REFINED = 8  # samples per part that are refined, for
 REFITS = 5  # rounds
 FEWEST_INLIERS = 4
-LEAST_GAIN = 2.0  # points explained, net of those that were explained before
+LEAST_GAIN = 2.0  # points explained, net of those explained before
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +38,12 @@ class Scene:
     Attributes:
         source, target: the scans.
         background: (3,) the motion.
-        gate: (M,) metres at which a target return still explains a point.
-        cost: (N,) in [0, 1], what the background leaves unexplained of every source point.
-        is_open: (N,) source points worth an explanation.
+        gate: (M,) metres within which a target return explains a point.
+        cost: (N,) in [0, 1], degree to which the background leaves a source point unexplained.
+        is_open: (N,) source points to be explained by movers.
         open_target: (T,) indices of such target points.
-        expected: (N, 2) where the background's motion brings the source points.
-        travel: (N,) metres that a point may be off there.
+        expected: (N, 2) source points under the background's motion.
+        travel: (N,) largest displacement of a point from there, metres.
     """
 
     source: Cloud
@@ -81,7 +81,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Mover:
-    """A motion (3,), the points (N,) that it explains better than the background does, and by how much in all."""
+    """A motion (3,), the points (N,) that it explains better than the background does, and its total gain."""
 
     motion: Floats
     members: Bools
@@ -89,7 +89,7 @@ class Mover:
 
 
 def match_ransac(pair: ScanPair, *, movers: int = 3) -> PairPrediction:
-    """Predicts background and up to `movers` movers; every point goes with the motion that brings it nearest to a return."""
+    """Predicts background and up to `movers` movers; a point is assigned to the motion that brings it nearest to a return."""
     if not len(pair.source) or not len(pair.target):
         return all_outliers(pair)
     scene = Scene.of(pair)
@@ -97,7 +97,7 @@ def match_ransac(pair: ScanPair, *, movers: int = 3) -> PairPrediction:
 
 
 def find_movers(scene: Scene, most: int) -> list[Mover]:
-    """At most `most` movers of falling gain, each with open points enough that no earlier one explains."""
+    """At most `most` movers of falling gain, each with enough open points that no earlier one explains."""
     rng = np.random.default_rng(SEED)
     found = [mover for part in open_parts(scene) if (mover := search_motion(scene, part, rng)) is not None]
     free = scene.is_open.copy()
@@ -112,7 +112,7 @@ def find_movers(scene: Scene, most: int) -> list[Mover]:
 
 
 def open_parts(scene: Scene) -> list[Ints]:
-    """The largest connected sets of open source points, by falling size; an object is in one place."""
+    """The largest connected sets of open source points, by falling size; an object is spatially connected."""
     open_points = np.flatnonzero(scene.is_open)
     points, reach = scene.source.points[open_points], LINK * scene.source.spacing[open_points]
     linked = cdist(points, points) <= np.maximum(reach[:, None], reach)
@@ -123,7 +123,7 @@ def open_parts(scene: Scene) -> list[Ints]:
 
 
 def search_motion(scene: Scene, part: Ints, rng: np.random.Generator) -> Mover | None:
-    """RANSAC of one part: sampled motions, the best of them refitted, the best of these if it gains enough. part: (P,)."""
+    """RANSAC within one part: sampled motions, of which the best are refitted; the best of these if it gains enough. part: (P,)."""
     window = np.flatnonzero(within_reach(scene.source, part))
     motions = sample_motions(scene, part, rng)
     motions = motions[np.argsort(-_gains(scene, motions, window).sum(-1), kind="stable")[:REFINED]]
@@ -140,9 +140,9 @@ def search_motion(scene: Scene, part: Ints, rng: np.random.Generator) -> Mover |
 
 
 def sample_motions(scene: Scene, part: Ints, rng: np.random.Generator) -> Floats:
-    """(S, 3) motions of two points of the part to two target returns as far apart, and shifts of one to one.
+    """(S, 3) motions of two points of the part to two target returns at equal distance, and shifts of one to one.
 
-    The first return is an unexplained one; both are within travel.
+    The first return is an open one; both are within travel.
     """
     can_reach = cdist(scene.expected[part], scene.target.points[scene.open_target]) <= scene.travel[part][:, None]  # (P, T)
     starts = np.flatnonzero(can_reach.any(-1))
@@ -166,20 +166,20 @@ def sample_motions(scene: Scene, part: Ints, rng: np.random.Generator) -> Floats
 
 
 def within_reach(source: Cloud, known: Ints | Bools) -> Bools:
-    """(N,) points that may belong to the object some of whose points are known (indices or mask, at least one)."""
+    """(N,) points that may belong to an object, given some of its points (indices or mask, at least one)."""
     points = source.points[known]
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     return cKDTree(points).query(source.points)[0] <= WINDOW * extent + LINK * source.spacing
 
 
 def label_points(pair: ScanPair, scene: Scene, movers: list[Mover]) -> PairPrediction:
-    """Every point goes with the motion that brings it nearest to a return, in shares of the gate; none within it: an outlier."""
+    """Assigns every point to the motion that brings it nearest to a return, relative to the gate; beyond it, outliers."""
     motions = np.stack([scene.background, *(mover.motion for mover in movers)])
     distance, nearest = scene.target.nearest(se2.apply(motions, scene.source.points))  # (K+1, N)
     share = np.where(distance <= scene.gate[nearest], distance / np.maximum(scene.gate[nearest], 1e-9), np.inf)
     for k, mover in enumerate(movers, start=1):
         share[k, ~within_reach(scene.source, mover.members)] = np.inf
-    cluster = share.argmin(0)  # the background first among equals
+    cluster = share.argmin(0)  # ties go to the background
     points = np.arange(len(cluster))
     is_explained = np.isfinite(share[cluster, points])
     association = np.where(is_explained, nearest[cluster, points], OUTLIER)
@@ -187,7 +187,7 @@ def label_points(pair: ScanPair, scene: Scene, movers: list[Mover]) -> PairPredi
 
 
 def _gains(scene: Scene, motions: Floats, window: Ints) -> Floats:
-    """(H, W) in [-1, 1]: how much better each motion explains the window's points than the background does."""
+    """(H, W) in [-1, 1]: reduction of the cost of the window's points by each motion, relative to the background."""
     distance, nearest = scene.target.nearest(se2.apply(motions, scene.source.points[window]))
     return scene.cost[window] - _miss(distance, scene.gate[nearest])
 
@@ -204,7 +204,7 @@ def _refit(scene: Scene, motions: Floats, window: Ints) -> Floats:
 
 
 def _is_plausible(scene: Scene, motions: Floats, part: Ints, window: Ints) -> Bools:
-    """(H,) motions that turn little and bring the window's centre no farther than anything travels."""
+    """(H,) motions of small rotation and of plausible travel of the window's centre."""
     centre = se2.apply(motions, scene.source.points[window]).mean(-2)  # (H, 2)
     travelled = np.linalg.norm(centre - scene.expected[window].mean(0), axis=-1)
     return _turns_little(scene, motions) & (travelled <= scene.travel[part].max())
@@ -220,5 +220,5 @@ def _miss(distance: Floats, gate: Floats) -> Floats:
 
 
 def _draw(allowed: Bools, rng: np.random.Generator) -> Ints:
-    """(S,) one random column of every row (S, T) among those allowed; column 0 where none is."""
+    """(S,) one random allowed column of every row (S, T); column 0 if none is allowed."""
     return (rng.random(allowed.shape) * allowed).argmax(-1)

@@ -1,4 +1,4 @@
-"""The methods that the joint model is compared with, in the order of the tables' rows: one line each."""
+"""Register of the methods compared with the joint model, in the order of the tables' rows: one line each."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from torchcrf_scan.scan import PairPrediction, ScanPair
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A pair, and what was found before a method is asked.
+    """A pair with the results that methods may build on.
 
     Attributes:
-        pair: without a look at its annotation. batch: the pair alone, as tensors. start: of InitialiseRT.
+        pair: without annotation. batch: the pair alone, as tensors. start: of InitialiseRT.
         cascade: the chains alone, fitted. icp_gate: metres, chosen on training pairs.
-        answers: of the rows before, by row.
+        answers: of earlier rows, by row.
     """
 
     pair: ScanPair
@@ -38,10 +38,10 @@ class Baseline:
     """A method.
 
     Attributes:
-        match: answers a case.
+        match: predicts a case.
         of_pair: the same from the pair alone; None: it needs more. command: its name in `torchcrf-scan evaluate --method`.
-        after: row whose answer it goes on from. from_start: it goes on from the start. The time of either counts as its own.
-        requires: module that need not be installed; empty: none.
+        after: row whose result it builds on. from_start: it builds on the start. The time of either is included in its own.
+        requires: optional module that it needs; empty: none.
     """
 
     match: Callable[[Case], PairPrediction]
@@ -53,7 +53,7 @@ class Baseline:
 
 
 def call(function: str, *arguments: Any, **settings: Any) -> PairPrediction:
-    """Calls `module:name` of this folder, imported when it is asked: most of them need scipy or more."""
+    """Calls `module:name` of `baselines`, imported on demand: most need scipy or more."""
     found: PairPrediction = load(f"baselines.{function}")(*arguments, **settings)
     return found
 
@@ -64,7 +64,7 @@ def alone(function: str, command: str = "", requires: str = "") -> Baseline:
 
 
 def k_means(after: str, *, remove_motion: bool = False) -> Baseline:
-    """K-Means on the displacements that another row found."""
+    """K-Means on the displacements of another row."""
     function = "kmeans:cluster_displacements"
     return Baseline(lambda case: call(function, case.pair, case.answers[after], remove_motion=remove_motion), after=after)
 
@@ -98,7 +98,7 @@ def can_import(module: str) -> bool:
 
 
 def installed() -> dict[str, Baseline]:
-    """Those that can be asked here; a library that is installed may still lack what it needs."""
+    """The methods whose libraries are installed."""
     return {row: baseline for row, baseline in BASELINES.items() if not baseline.requires or can_import(baseline.requires)}
 
 

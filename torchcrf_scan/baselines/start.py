@@ -1,7 +1,7 @@
-"""Start and gated nearest neighbour: motions found without a random field, every point labelled by what lies nearest.
+"""Start and gated nearest neighbour: motions without a random field, every point labelled by its nearest target point.
 
-`match_start` takes the motions of InitialiseRT and is the rival that the field has to earn its place against; `match_static`
-takes the identity and nothing else. The labels carry no belief: the confidences of valid beams are 1.
+`match_start` uses the motions of InitialiseRT and shows the contribution of the random field; `match_static`
+uses the identity. The labels carry no belief: the confidences of valid beams are 1.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torchcrf_scan.scan import PairPrediction, ScanPair
 
 @torch.no_grad()
 def match_start(model: JointScanCRF, pairs: Sequence[ScanPair], batch_size: int = 16) -> list[PairPrediction]:
-    """Predicts from `model.initialise` alone: no chains, no iterations. On the model's device and in its dtype."""
+    """Predictions from `model.initialise` alone: no chains, no iterations. On the model's device and in its dtype."""
     reference = next(model.parameters())
     found = []
     for part in _parts(pairs, batch_size):
@@ -35,7 +35,7 @@ def match_start(model: JointScanCRF, pairs: Sequence[ScanPair], batch_size: int 
 
 @torch.no_grad()
 def match_static(pairs: Sequence[ScanPair], batch_size: int = 16) -> list[PairPrediction]:
-    """Predicts that nothing moves, the sensor neither: background everywhere, nearest points inside the gate."""
+    """Predictions of a static world and sensor: background everywhere, nearest points inside the gate."""
     found = []
     for part in _parts(pairs, batch_size):
         batch = ScanPairBatch.collate(part).without_truth()
@@ -56,7 +56,7 @@ def label_nearest(batch: ScanPairBatch, start: Start) -> Prediction:
     is_outlier = association < 0  # (B, N)
     motion_count = start.motions.shape[1]
     cluster = nearest_motion(batch, start)
-    states = torch.stack([~is_outlier, is_outlier], dim=-1)  # (B, N, 2): the one candidate, outlier
+    states = torch.stack([~is_outlier, is_outlier], dim=-1)  # (B, N, 2): the only candidate, outlier
     labels = functional.one_hot(cluster.masked_fill(is_outlier, motion_count), motion_count + 1)  # (B, N, D)
     return Prediction(
         association=association,

@@ -1,6 +1,6 @@
-"""Trimmed iterated closest points in one rigid motion, from a grid of starts: the classical registration at its best.
+"""Trimmed iterated closest points for one rigid motion, from a grid of starts: a strong classical registration.
 
-All gates are multiples of what the scans resolve, so one setting serves a street and a table top.
+All gates are multiples of the scans' resolution, so one setting serves a street and a table top.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ COARSE_POINTS = 80
 COARSE_GATES = (16.0, 16.0, 12.0, 12.0, 8.0, 8.0, 6.0, 4.0)  # units of resolution, one per iteration
 FINE_GATES = (4.0, 4.0, 3.0, 3.0, 2.0, 2.0, 2.0, 2.0)
 LINE_GATES = (3.0, 3.0, 2.0, 2.0, 2.0, 1.5, 1.5, 1.5)
-REFINED = 4  # starts worth a refinement
-TRUNCATION = 3.0  # units: a residual as bad as any
-REACH = 0.12  # of the median range: the shifts of the grid
+REFINED = 4  # number of starts to refine
+TRUNCATION = 3.0  # units; larger residuals are clipped
+REACH = 0.12  # of the median range: unit of the grid's shifts
 TURNS = (0.0, 0.12, -0.12, 0.3, -0.3)  # radians
 SHIFTS = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (2.5, 0.0), (-2.5, 0.0))  # multiples of the reach
 
@@ -42,7 +42,7 @@ def match_under(pair: ScanPair, motion: Floats) -> PairPrediction:
 
 
 def association_gate(distance: Floats, target: Cloud) -> Floats:
-    """(M,) metres that a counterpart may be away: half the way to the next return, the usual spacing and the usual residual.
+    """(M,) maximum distance to a counterpart, metres: half the distance to the next return, usual spacing and usual residual.
 
     distance: (N,) of the source's points to their nearest returns, under the motion of most of them.
     """
@@ -50,7 +50,7 @@ def association_gate(distance: Floats, target: Cloud) -> Floats:
 
 
 def register_trimmed(source: Cloud, target: Cloud) -> Floats:
-    """(3,) `T_target_source`: coarse ICP from every start, fine ICP and point-to-line steps from the best, the best of these."""
+    """(3,) `T_target_source`: coarse ICP from every start, fine ICP and point-to-line steps from the best ones; the best result."""
     unit = resolution(source, target)
     stride = max(1, math.ceil(len(source) / COARSE_POINTS))
     motions = start_grid(source, target)
@@ -70,7 +70,7 @@ def resolution(source: Cloud, target: Cloud) -> float:
 
 
 def start_grid(source: Cloud, target: Cloud) -> Floats:
-    """(H, 3) the identity, and turns and shifts in shares of the scene's size."""
+    """(H, 3) the identity, and rotations and shifts scaled by the scene's size."""
     reach = REACH * np.median(np.concatenate([source.ranges, target.ranges]))
     return np.array([[turn, x * reach, y * reach] for turn in TURNS for x, y in SHIFTS])
 
@@ -84,7 +84,7 @@ def trimmed_step(motions: Floats, points: Floats, target: Cloud, gate: float) ->
 
 
 def line_step(motions: Floats, points: Floats, target: Cloud, gate: float) -> Floats:
-    """The same with distances across the surface alone (point to line), by one damped Gauss-Newton step."""
+    """The same with distances across the surface only (point to line), by one damped Gauss-Newton step."""
     moved = se2.apply(motions, points)  # (H, P, 2)
     distance, index = target.nearest(moved)
     tangent = target.tangent[index]

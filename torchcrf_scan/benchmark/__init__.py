@@ -1,5 +1,5 @@
-"""What the model costs: whole pairs by size, batch and threads, learning, memory, rivals in the same run, and the limit.
+"""Costs of the model: whole pairs by size, batch and threads, learning, memory, rivals in the same run, and the limit.
 
-`torchcrf-scan bench` puts the parts together (`study.py`). Everything is timed in turns (`timing.py`), so that other load on the
-machine falls on all alike.
+`torchcrf-scan bench` combines the parts (`study.py`). All tasks are timed in turns (`timing.py`), so that other load on the
+machine affects all alike.
 """

@@ -1,6 +1,6 @@
-"""This package beside another checkout of it: the same calls, in turns, in a process each; ratios of processor times.
+"""Comparison with another checkout of this package: the same calls, in turns, in one process each; ratios of processor times.
 
-Both processes run the same small program, which uses only what every version of the package has.
+Both processes run the same small program, which uses only the interface common to all versions of the package.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ def compare(pairs: Sequence[ScanPair], model: str, other: Path, repeats: int) ->
     """Rows of milliseconds a pair of this package and of another checkout, medians of calls in turns, and the ratio of both.
 
     Args:
-        pairs: annotated pairs. model: name of a shipped model. other: folder that holds the other `torchcrf_scan`.
-        repeats: calls of every task, the first, which warms up, apart.
+        pairs: annotated pairs. model: name of a shipped model. other: folder that contains the other `torchcrf_scan`.
+        repeats: timed calls of every task, after one to warm up.
     """
     if not (other / "torchcrf_scan" / "__init__.py").is_file():
         raise ValueError(f"--beside: expected a folder that holds torchcrf_scan, got {other}")
@@ -114,7 +114,7 @@ def _start(tree: Path, model: str, files: Sequence[Path]) -> subprocess.Popen[st
 def _ask(process: subprocess.Popen[str], task: str, turn: int) -> float:
     assert process.stdin is not None
     assert process.stdout is not None
-    with suppress(BrokenPipeError):  # told below
+    with suppress(BrokenPipeError):  # reported below
         process.stdin.write(f"{task} {turn}\n")
         process.stdin.flush()
     answer = process.stdout.readline()

@@ -1,4 +1,4 @@
-"""What only a fresh process can tell: the first call after the import, and the peak of memory."""
+"""Measurements in a fresh process: the first call after the import, and the peak of memory."""
 
 from __future__ import annotations
 
@@ -30,8 +30,10 @@ def ask_fresh_process(model: str, backend: str, mode: str, pairs: Sequence[ScanP
     """Matches annotated pairs as one batch in a process of its own.
 
     Returns:
-        `first_call_ms`, of the first pair alone; `peak_mb`, MB by which the most memory held at any time exceeds what the
-        interpreter takes with torch loaded. ValueError where the process fails.
+        `first_call_ms`, of the first pair alone; `peak_mb`, peak memory in MB above that of the interpreter with torch loaded.
+
+    Raises:
+        ValueError: the process fails.
     """
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / f"{k}.npz" for k in range(len(pairs))]
@@ -46,7 +48,7 @@ def ask_fresh_process(model: str, backend: str, mode: str, pairs: Sequence[ScanP
 
 
 def tell(before: str, model: str, backend: str, mode: str, *files: str) -> None:
-    """The child's part: prints what `ask_fresh_process` returns. before: the process's status with torch loaded."""
+    """Runs in the child: prints the results of `ask_fresh_process`. before: the process's status with torch loaded."""
     network = with_backend(JointScanCRF.from_pretrained(model), backend)
     pairs = in_mode([read_pair(file) for file in files], mode)
     began = time.perf_counter()
@@ -58,6 +60,6 @@ def tell(before: str, model: str, backend: str, mode: str, *files: str) -> None:
 
 
 def high_water_mark(status: str) -> float:
-    """MB that the process held in memory at most, from Linux' description of it."""
+    """Peak memory of the process in MB, from its Linux status file."""
     kilobytes = next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM:"))
     return int(kilobytes) / 1024

@@ -1,7 +1,7 @@
-"""The limit: operations and bytes that a whole pair needs at least, and the time that this machine would take for them.
+"""The limit: minimum operations and bytes of a whole pair, and the time that this machine would take for them.
 
-An operation is an addition, a product, a comparison, a look-up, a root, a quotient or a trigonometric function alike, at the rate
-of a matrix product: no program gets there. Bytes are those of the tables that are written and read, as if they went to memory and
+Additions, products, comparisons, look-ups, roots, quotients and trigonometric functions all count as one operation, at the rate
+of a matrix product, which no program reaches. Bytes are those of the tables written and read, as if they went to memory and
 came back. Nearest points are found through boxes round runs of neighbours, not by N M distances.
 """
 
@@ -19,23 +19,23 @@ from torchcrf_scan.inference.joint import SELECTION_ROUNDS
 from torchcrf_scan.names import ASSOCIATION_UNARY, CLUSTERING_UNARY, LOCAL_CHANNELS, SHAPE_CHANNELS
 from torchcrf_scan.search import cold, hypotheses, pool
 
-COPIED = 2**23  # numbers of a copy, far more than any cache holds
+COPIED = 2**23  # numbers in a copy, far more than any cache holds
 MATRIX = 512
-VECTOR = 4096  # numbers that stay in the first cache
+VECTOR = 4096  # numbers that fit the first-level cache
 REPEATS = 15
 NUMBER = 8  # bytes of a double
 RUN = 8  # points in a box, and boxes in a large box
 BOX, POINT = 6, 5  # operations of the distance to a box, and to a point
-MOVE, STEP = 8, 40  # operations that move a point, and that it adds to a Gauss-Newton step
-LOOK = 30  # of what the beams say of a point
+MOVE, STEP = 8, 40  # operations to move a point, and of a point in a Gauss-Newton step
+LOOK = 30  # of the free-space test of a point
 SQUARE = 4  # of a robust square
 GRID = 40  # starts of the background's search
-GROUPS = 30  # segments that may be movers, in a street
+GROUPS = 30  # segments in a street that may be movers
 
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Of one thread: bytes a second to and from memory; double-precision operations a second in matrices and in plain vectors."""
+    """Rates of one thread: bytes a second to and from memory; double-precision operations a second in matrices and in vectors."""
 
     bandwidth: float
     matrix: float
@@ -44,11 +44,11 @@ class Rates:
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """What the counts depend on.
+    """Problem size of the counts.
 
     Attributes:
-        points: N of either scan. candidates: K. clusters: D, of which `motions` exist. rounds: of decoding. stumps: of a booster.
-        is_warm: a prior motion leads to the background's, which then need not be searched for.
+        points: N of either scan. candidates: K. clusters: D, of which `motions` exist. rounds: of inference. stumps: of a booster.
+        is_warm: the background is registered from a prior motion instead of searched for.
     """
 
     points: int = 361
@@ -71,7 +71,7 @@ class Work:
         return Work(self.operations + other.operations, self.bytes + other.bytes)
 
     def times(self, factor: float) -> Work:
-        """So many times the work."""
+        """The work multiplied by a factor."""
         return Work(factor * self.operations, factor * self.bytes)
 
     def milliseconds(self, rates: Rates) -> float:
@@ -80,7 +80,7 @@ class Work:
 
 
 def nearest(points: int) -> float:
-    """Operations that find the nearest of N points: all large boxes, the small ones of two of them, the points of two of those."""
+    """Operations to find the nearest of N points: all large boxes, the small ones of two of them, the points of two of those."""
     return BOX * math.ceil(points / RUN**2) + 2 * RUN * BOX + 2 * RUN * POINT
 
 
@@ -99,7 +99,7 @@ def _descriptors(size: Size) -> Work:
 
 
 def _candidates(size: Size) -> Work:
-    """Every motion moves every point, finds its nearest and puts the K about it in order."""
+    """Every motion moves every point, finds its nearest target and sorts the K around it."""
     per_point = size.motions * (MOVE + nearest(size.points) + 2 * size.candidates * POINT)
     return Work(size.points * per_point, size.points * (2 + size.candidates + size.motions) * NUMBER)
 
@@ -152,7 +152,7 @@ def _messages(size: Size) -> Work:
 
 
 def _motion_update(size: Size) -> Work:
-    """Every point adds to the step of its own cluster."""
+    """The contribution of every point to the step of its own cluster."""
     return Work(size.points * (MOVE + STEP + 10.0), size.points * 8.0 * NUMBER)
 
 
@@ -163,7 +163,7 @@ def _read_out(size: Size) -> Work:
 
 
 def _initialisation(size: Size) -> Work:
-    """InitialiseRT: the background, followed from the prior or searched for, and the movers' hypotheses."""
+    """InitialiseRT: the background, registered from the prior or searched for, and the movers' hypotheses."""
     n = size.points
     settled = hypotheses.STARTS * hypotheses.REGISTER_POINTS * 6 * _pull(n)
     screened = 3 * GROUPS * hypotheses.SCREEN_POINTS * (MOVE + nearest(n))
@@ -174,12 +174,12 @@ def _initialisation(size: Size) -> Work:
 
 
 def _pull(points: int) -> float:
-    """Operations of a point in an iteration of a registration."""
+    """Operations per point in one iteration of a registration."""
     return MOVE + nearest(points) + STEP
 
 
 def _charge(points: int) -> float:
-    """Operations of a point where motions are compared."""
+    """Operations per point to compare motions."""
     return MOVE + nearest(points) + LOOK + 15
 
 

@@ -1,4 +1,4 @@
-"""What is asked for: sizes, backends, pairs and models."""
+"""The plan of a benchmark: sizes, backends, pairs and models."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from torchcrf_scan.benchmark.scenes import MODES, in_mode, street_pairs
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
 
-CENTRE = 361  # beams at which all else is compared
-GROWTH = 1.5  # a guess of how time grows with the number of beams, to foresee a call
+CENTRE = 361  # beams of the reference setting
+GROWTH = 1.5  # assumed exponent of time over the number of beams, to predict the duration of a call
 SIMULATED, RECORDED = "simulated", "recorded"
 WHOLE = "whole"  # stage of the rows of whole pairs
 BACKENDS = ("compiled", "eager")
@@ -24,7 +24,7 @@ Setting = tuple[int, int, int]  # batch, beams, threads
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is asked for.
+    """Settings of a benchmark.
 
     Attributes:
         model: name or folder. backends, beams, batches, threads: values of the rows.
@@ -45,25 +45,25 @@ class Plan:
 
     @property
     def centre(self) -> Setting:
-        """Batch, beams and threads from which one at a time is varied."""
+        """The reference setting (batch, beams, threads), from which one value at a time is varied."""
         return min(self.batches), min(self.beams, key=lambda beams: abs(beams - CENTRE)), min(self.threads)
 
 
 def settings_of(plan: Plan, backend: str) -> list[Setting]:
-    """All combinations; of the reference, which is slow, those around the centre."""
+    """All combinations; for the slow backend `eager` those around the centre."""
     is_slow = backend == "eager" and not plan.is_full
     return around_centre(plan) if is_slow else list(product(plan.batches, plan.beams, plan.threads))
 
 
 def around_centre(plan: Plan) -> list[Setting]:
-    """Those that differ from the centre in one thing alone."""
+    """Settings that differ from the centre in one value."""
     every = product(plan.batches, plan.beams, plan.threads)
     return [one for one in every if sum(a != b for a, b in zip(one, plan.centre, strict=True)) <= 1]
 
 
 @dataclass(slots=True)
 class Material:
-    """The pairs and models of a plan, made when first asked for."""
+    """The pairs and models of a plan, made on demand and cached."""
 
     plan: Plan
     _pairs: dict[tuple[int, str], list[ScanPair]] = field(default_factory=dict)
@@ -77,19 +77,19 @@ class Material:
         return self._pairs[beams, mode]
 
     def model(self, backend: str) -> JointScanCRF:
-        """The model on one backend."""
+        """The model with one backend."""
         if backend not in self._models:
             self._models[backend] = with_backend(JointScanCRF.from_pretrained(self.plan.model), backend)
         return self._models[backend]
 
 
 def place_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Backend, mode, batch, beams and threads, None for what the row does not have."""
+    """Backend, mode, batch, beams and threads, None for keys missing in the row."""
     return tuple(row.get(key) for key in ("backend", "mode", "batch", "beams", "threads"))
 
 
 def choose_backends(wanted: Sequence[str]) -> tuple[str, ...]:
-    """Those that are wanted, or all where none is named. Raises ValueError for an unknown one."""
+    """The backends wanted, by default all. Raises ValueError for an unknown one."""
     for name in wanted:
         if name not in BACKENDS:
             raise ValueError(f"--backends: expected some of {', '.join(BACKENDS)}, got {name}")
@@ -97,7 +97,7 @@ def choose_backends(wanted: Sequence[str]) -> tuple[str, ...]:
 
 
 def with_backend(model: JointScanCRF, backend: str) -> JointScanCRF:
-    """The same model, its rounds run by one of `BACKENDS`."""
+    """The same model with one of `BACKENDS`."""
     other = copy.copy(model)
     other.config = replace(model.config, inference=replace(model.config.inference, backend=backend))
     return other

@@ -1,4 +1,4 @@
-"""The report: rows as JSON, and as the tables that one looks at."""
+"""The report of a benchmark: rows as JSON, and summary tables."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from torchcrf_scan.evaluation.report import Table
 
 Row = Mapping[str, Any]
 NAN = float("nan")
-EVERYWHERE = ("stage", "mode", "batch", "beams", "threads", "median_ms_per_pair")  # keys that every row has
+EVERYWHERE = ("stage", "mode", "batch", "beams", "threads", "median_ms_per_pair")  # keys of every row
 
 
 def write_report(path: Path, rows: Sequence[Row], rates: Rates) -> None:
-    """`{"machine": ..., "rows": [...]}`, whole or not at all; null where there is nothing to tell."""
+    """Writes `{"machine": ..., "rows": [...]}` atomically, with null for missing values."""
     machine = {**describe_machine(), "per_second_one_thread": asdict(rates)}
     text = json.dumps({"machine": machine, "rows": [_finite(row) for row in rows]}, indent=1, allow_nan=False) + "\n"
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
@@ -62,7 +62,7 @@ def _finite(row: Row) -> dict[str, Any]:
 
 
 def report_tables(rows: Sequence[Row], rates: Rates) -> list[Table]:
-    """Those that have rows, in the order in which one asks."""
+    """All tables that have rows."""
     of_stage: dict[str, list[Row]] = {}
     for row in rows:
         of_stage.setdefault(row["stage"], []).append(row)
@@ -86,12 +86,12 @@ def _number(row: Row, key: str) -> float:
 
 
 def _values(rows: Iterable[Row], key: str) -> list[Any]:
-    """What occurs, in order of appearance."""
+    """Distinct values of a key, in order of appearance."""
     return list(dict.fromkeys(row[key] for row in rows))
 
 
 def _pivot(rows: Sequence[Row], keys: Sequence[str], across: str, cell: str) -> tuple[list[Any], list[tuple[Any, ...]]]:
-    """The values of `across`, and rows of the values of `keys` (as text) and a cell for each."""
+    """The distinct values of `across`, and rows of the values of `keys` (as text) with a cell for each of them."""
     columns = _values(rows, across)
     found: dict[tuple[str, ...], dict[Any, float]] = {}
     for row in rows:
@@ -104,7 +104,7 @@ def _sorted(rows: Sequence[Row], keys: Sequence[str]) -> list[Row]:
 
 
 def whole_table(rows: Sequence[Row]) -> Table:
-    """Simulated pairs: a column a number of beams."""
+    """Simulated pairs: one column per number of beams."""
     keys = ("backend", "mode", "batch", "threads")
     mine = _sorted([row for row in rows if row["data"] == "simulated"], ("backend", "mode", "batch", "threads", "beams"))
     columns, cells = _pivot(_sorted(mine, ("beams",)), keys, "beams", "median_ms_per_pair")
@@ -130,7 +130,7 @@ def _ratios(rows: Sequence[Row], suffix: str) -> list[str]:
 
 
 def registration_table(rows: Sequence[Row]) -> Table:
-    """What others need for one rigid motion, and how many times that the whole pair takes."""
+    """Times of rivals for one rigid motion, and the ratio of the whole pair to them."""
     ratios = _ratios(rows, "_to_rival")
     headings = ("rival", "data", "mode", "ms per pair", *(f"whole pair / rival, {key.removesuffix('_to_rival')}" for key in ratios))
     cells = (
@@ -153,7 +153,7 @@ def _note(row: Row) -> str:
 
 
 def chain_table(rows: Sequence[Row]) -> Table:
-    """One chain: ours give the max-marginals of every node, both directions."""
+    """One chain: ours compute the max-marginals of every node, both directions."""
     ratios = _ratios(rows, "_to_this")
     headings = (
         "decoder",
@@ -197,7 +197,7 @@ def training_table(rows: Sequence[Row]) -> Table:
 
 
 def limit_table(rows: Sequence[Row], rates: Rates) -> Table:
-    """How far from what the machine could do."""
+    """Ratio of measured times to the machine's limit."""
     backends = [key.removesuffix("_to_limit") for key in _ratios(rows, "_to_limit")]
     columns = (f"{name}{end}" for name in backends for end in (", ms", " / limit"))
     headings = ("mode", "operations (M)", "bytes (MB)", "limit, ms", *columns)

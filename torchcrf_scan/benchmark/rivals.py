@@ -1,4 +1,4 @@
-"""Other people's libraries on the same work: registration of the same pair, decoding of the same chain; absent ones are noted."""
+"""Third-party libraries on the same work: registration of the same pair, decoding of the same chain; missing ones are noted."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ REGISTRATIONS: Mapping[str, Callable[[], Register]] = {"small_gicp ICP": load_sm
 
 
 def make_chain(nodes: int, states: int) -> tuple[Tensor, Tensor]:
-    """Log potentials (N, S) of the nodes and (S, S) of every edge, which all libraries can take."""
+    """Log potentials (N, S) of the nodes and (S, S) of every edge, in a form common to all libraries."""
     generator = torch.Generator().manual_seed(SEED)
     return torch.randn(nodes, states, generator=generator), torch.randn(states, states, generator=generator)
 
 
 def viterbi(log_unary: Floats, log_pairwise: Floats) -> Ints:
-    """(N,) best labelling in plain numpy, a step a node. log_unary: (N, S); log_pairwise: (N-1, S, S)."""
+    """(N,) best labelling in plain numpy, one step per node. log_unary: (N, S); log_pairwise: (N-1, S, S)."""
     score, back = log_unary[0], np.empty(log_pairwise.shape[:2], dtype=np.int64)
     for i, edge in enumerate(log_pairwise):
         total = score[:, None] + edge  # (S, S)
@@ -64,13 +64,13 @@ def viterbi(log_unary: Floats, log_pairwise: Floats) -> Ints:
 
 
 def chain_of_eager(unary: Tensor, transition: Tensor) -> Decode:
-    """The reference: max-marginals of every node, both directions."""
+    """The backend `eager`: max-marginals of every node, both directions."""
     edges, mask = transition.expand(1, len(unary) - 1, -1, -1).contiguous(), torch.ones(1, len(unary), dtype=torch.bool)
     return torch.no_grad()(lambda: chain_beliefs(unary[None], edges, mask)[0].argmax(-1))
 
 
 def chain_of_compiled(unary: Tensor, transition: Tensor) -> Decode:
-    """The same in machine code."""
+    """The backend `compiled`: the same in machine code."""
     messages: Any = import_module("torchcrf_scan.loops.messages")
     nodes, edges = unary.double().numpy(), transition.double().expand(len(unary) - 1, -1, -1).contiguous().numpy()
     return lambda: messages.max_marginals(nodes, edges).argmax(-1)
@@ -97,7 +97,7 @@ def _struct_chain(unary: Tensor, transition: Tensor) -> Any:
     edges = transition.T + unary[1:, :, None]  # (N-1, S, S), row = state of the later node
     edges[0] += unary[0]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it says nothing of the range of its arguments
+        warnings.simplefilter("ignore")  # it warns about the range of its arguments
         return import_module("torch_struct").LinearChainCRF(edges[None])
 
 
@@ -118,7 +118,7 @@ def struct_marginals(unary: Tensor, transition: Tensor) -> Decode:
     return lambda: _struct_chain(unary, transition).marginals
 
 
-CHAINS: Mapping[str, tuple[Callable[[Tensor, Tensor], Decode], str]] = {  # name: what decodes the chain, what it gives
+CHAINS: Mapping[str, tuple[Callable[[Tensor, Tensor], Decode], str]] = {  # name: decoder of the chain, its result
     "eager": (chain_of_eager, "max-marginals of every node"),
     "compiled": (chain_of_compiled, "max-marginals of every node"),
     "pytorch-crf": (chain_of_pytorch_crf, "best labelling alone; it has one transition matrix for all edges"),
@@ -131,7 +131,7 @@ WITHOUT_LABELS = ("torch-struct marginals",)
 
 
 def load(make: Callable[..., Any], *arguments: object) -> tuple[Any, str]:
-    """What it makes, and "", or nothing and the reason where a library is not there or cannot be used."""
+    """The result of `make` and "", or None and the reason if a library is missing or unusable."""
     try:
         return make(*arguments), ""
     except (ImportError, OSError, AttributeError, RuntimeError, TypeError) as error:

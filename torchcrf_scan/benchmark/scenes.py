@@ -1,4 +1,4 @@
-"""The pairs that are timed: simulated streets seen by scanners of any resolution, and what odometry would say of them."""
+"""The pairs to time: simulated streets at any angular resolution, with simulated odometry."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def street_pairs(beams: int, count: int) -> list[ScanPair]:
 
 
 def in_mode(pairs: Sequence[ScanPair], mode: str) -> list[ScanPair]:
-    """The pairs without a prior motion (`cold`), or with the annotated one disturbed as odometry is (`warm`); without one: none."""
+    """The pairs without a prior motion (`cold`), or with the annotated one plus odometry errors (`warm`); unannotated: none."""
     if mode == "cold":
         return [replace(pair, initial_motion=None) for pair in pairs]
     generator = np.random.default_rng(SEED)
@@ -36,5 +36,5 @@ def in_mode(pairs: Sequence[ScanPair], mode: str) -> list[ScanPair]:
 
 
 def cycle(pairs: Sequence[ScanPair], first: int, count: int) -> list[ScanPair]:
-    """So many of the pairs from a number on, again and again."""
+    """`count` pairs from index `first` on, cyclically."""
     return [pairs[(first + k) % len(pairs)] for k in range(count)]

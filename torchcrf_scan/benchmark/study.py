@@ -1,4 +1,4 @@
-"""All of `torchcrf-scan bench` but learning: the rows of the report."""
+"""All measurements of `torchcrf-scan bench` except learning: the rows of the report."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FITTED_FROM = 361  # beams from which the growth is fitted
 
 
 def time_chains(plan: Plan) -> list[Row]:
-    """One chain of a scan, 16 and 17 states, by us and by others in turns; ratios to each of ours."""
+    """One chain of a scan, 16 and 17 states, by this package and by others in turns; ratios to each of ours."""
     rows: list[Row] = []
     for states in rivals.STATES:
         unary, transition = rivals.make_chain(rivals.NODES, states)
@@ -93,7 +93,7 @@ def fresh_rows(plan: Plan, material: Material) -> list[Row]:
 
 
 def limit_rows(plan: Plan, material: Material, timed: Sequence[Row], rates: Rates) -> list[Row]:
-    """Work of a whole pair at the centre, the time at the machine's limit, and measured times over it."""
+    """Work of a whole pair at the centre, the time at the machine's limit, and the ratio of measured times to it."""
     batch, beams, threads = plan.centre
     rows = []
     for mode in MODES:
@@ -113,7 +113,7 @@ def limit_rows(plan: Plan, material: Material, timed: Sequence[Row], rates: Rate
 
 @torch.no_grad()
 def size_of(material: Material, beams: int, mode: str) -> limits.Size:
-    """The usual numbers of points, rounds and motions of the pairs of one size."""
+    """Typical numbers of points, rounds and motions of the pairs of one size."""
     pairs, model = material.pairs(beams, mode), material.model("compiled")
     answers = model(ScanPairBatch.collate(pairs).without_truth())
     points = round(float(np.mean([len(pair.source) for pair in pairs])))
@@ -130,7 +130,7 @@ def size_of(material: Material, beams: int, mode: str) -> limits.Size:
 
 
 def run_study(plan: Plan, rates: Rates) -> list[Row]:
-    """All rows but those of learning."""
+    """All rows except those of learning."""
     material = Material(plan)
     timed = time_whole(plan, material)
     times = [one.as_row() for one in timed if one.task.row["stage"] == WHOLE]

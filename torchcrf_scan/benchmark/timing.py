@@ -1,4 +1,4 @@
-"""Timing in turns: every round times every task once, so that a slow moment falls on all of them; medians over the rounds."""
+"""Timing in turns: every round times every task once, so that slow moments affect all of them; medians over the rounds."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-ENOUGH = 3.0  # seconds that a task is timed for in all; a call that takes longer is made once
+ENOUGH = 3.0  # seconds after which a task is not repeated; a longer call is made once
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Something to time.
+    """A function to time.
 
     Attributes:
-        row: what the report's row says beside the times.
-        run: what is timed, given the number of the round.
-        pairs: pairs that one call handles. threads: of torch. rounds: calls at most.
-        series: tasks of one series differ in `size` alone, to which their time is about proportional: so a call can be foreseen.
+        row: entries of the report's row in addition to the times.
+        run: the function to time, given the number of the round.
+        pairs: pairs per call. threads: of torch. rounds: maximum number of calls.
+        series: tasks of one series differ in `size` alone, to which their time is about proportional, so that it can be predicted.
     """
 
     row: Mapping[str, Any]
@@ -37,7 +37,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Timed:
-    """A task and what it took: seconds of a call by the number of its round; `foreseen` seconds where it was not made."""
+    """A task with its times: seconds of a call by the number of its round; `foreseen` seconds if it was not called."""
 
     task: Task
     seconds: dict[int, float] = field(default_factory=dict)
@@ -49,12 +49,12 @@ class Timed:
         return 1e3 * statistics.median(self.seconds.values()) / self.task.pairs if self.seconds else float("nan")
 
     def ratio(self, other: Timed) -> float:
-        """Median over the rounds that both have of this one's time over the other's, per pair; NaN where there is none."""
+        """Median ratio of this task's time to the other's over their common rounds, per pair; NaN without any."""
         both = [self.seconds[k] / other.seconds[k] for k in self.seconds.keys() & other.seconds.keys()]
         return statistics.median(both) * other.task.pairs / self.task.pairs if both else float("nan")
 
     def as_row(self) -> dict[str, Any]:
-        """The row of the report; of a task that was not to be timed, with its own note."""
+        """The row of the report; for a task that is not to be timed, with its note."""
         row = {**self.task.row, "median_ms_per_pair": self.milliseconds if self.seconds else None, "runs": len(self.seconds)}
         if self.foreseen:
             row["note"] = f"left out: a call would take about {self.foreseen:.0f} s, more than --patience"
@@ -64,7 +64,8 @@ class Timed:
 def time_in_turns(tasks: Sequence[Task], patience: float, title: str = "rounds", enough: float = ENOUGH) -> list[Timed]:
     """Times the tasks round by round, small ones first; each until it has its rounds or `enough` seconds.
 
-    patience: seconds that a call may take; one that would take longer is left out, but never the smallest of a series.
+    Args:
+        patience: seconds of a call; longer ones are skipped, but never the smallest of a series.
     """
     timed = [Timed(task) for task in sorted(tasks, key=lambda task: task.size)]
     with threads_kept():
@@ -81,7 +82,7 @@ def time_in_turns(tasks: Sequence[Task], patience: float, title: str = "rounds",
 
 @contextmanager
 def threads_kept() -> Iterator[None]:
-    """Whatever number of threads torch is told to use in between, it has its own again afterwards."""
+    """Context that restores the number of threads of torch at its end."""
     kept = torch.get_num_threads()
     try:
         yield
@@ -90,13 +91,13 @@ def threads_kept() -> Iterator[None]:
 
 
 def _foresee(task: Task, timed: Sequence[Timed]) -> float:
-    """Seconds of a call, from the largest of the series that has been made; 0 where none has."""
+    """Predicted seconds of a call, from the largest of the series called so far; 0 without any."""
     known = [one for one in timed if one.seconds and one.task.series == task.series]
     return known[-1].seconds[0] * task.size / known[-1].task.size if known else 0.0
 
 
 def _time(task: Task, turn: int) -> float:
-    """Processor time where there is one thread, whatever else the cores do; the wall's where threads share the work."""
+    """Processor time of a single thread, independent of other load; wall time if threads share the work."""
     torch.set_num_threads(task.threads)
     clock = time.process_time if task.threads == 1 else time.perf_counter
     began = clock()
@@ -105,7 +106,7 @@ def _time(task: Task, turn: int) -> float:
 
 
 def least_seconds(run: Callable[[], object], repeats: int) -> float:
-    """Least seconds of a call: what is possible. The first call is left out."""
+    """Minimum of the seconds of several calls, after one to warm up."""
     run()
     found = []
     for _ in range(repeats):

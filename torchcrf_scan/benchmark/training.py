@@ -1,4 +1,4 @@
-"""What learning costs: one fold of the experiment, all folds, and a pass over a thousand pairs."""
+"""Times of learning: one fold of the experiment, all folds, and a pass over a thousand pairs."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ ROUNDS, BATCHES = 3, (1, 32)  # of the unrolled layer, motions soft
 def time_training(pairs: Sequence[ScanPair], config: ModelConfig, learning: LearningConfig) -> list[dict[str, Any]]:
     """Rows of `stage`, `seconds` and `pairs`, on one thread, as folds run; each part is timed once.
 
-    Looking at a pair is done once for all folds; a fold fits the movers' score, scales, boosters, weights, the movers' worth and
-    the confidences. A training pass is the pseudo-likelihood and its gradient. The rows of all folds and of the pass are scaled.
+    Pairs are surveyed once for all folds; a fold fits the movers' score, scales, boosters, weights, the potential of movers and
+    the calibration. A training pass is the pseudo-likelihood and its gradient. The rows of all folds and of the pass are scaled.
     """
     with threads_kept():
         torch.set_num_threads(1)
@@ -75,7 +75,7 @@ def _rows(pairs: Sequence[ScanPair], config: ModelConfig, learning: LearningConf
 
 
 def _rounds(pairs: Sequence[ScanPair], size: int) -> float:
-    """Seconds of the unrolled layer and its gradient for a batch of some size; the second of two calls."""
+    """Seconds of the unrolled rounds with gradient for a batch of a given size; the second of two calls."""
     model = JointScanCRF.from_pretrained(motion_weights="soft", stop_early=False, iterations=ROUNDS)
     batch = ScanPairBatch.collate([pairs[k % len(pairs)] for k in range(size)]).without_truth()
     start = model.initialise(batch)

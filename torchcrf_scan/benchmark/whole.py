@@ -1,4 +1,4 @@
-"""Times of whole pairs, and of other people's registration of the same pairs, in turns."""
+"""Times of whole pairs, and of third-party registration of the same pairs, in turns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchcrf_scan.scan import ScanPair
 def time_whole(plan: Plan, material: Material) -> list[Timed]:
     """Every backend in all its settings, rivals on the centre's pairs and on recorded ones, all in turns."""
     for backend in plan.backends:
-        material.model(backend).match_pairs(material.pairs(min(plan.beams), "cold")[:1])  # code is loaded, caches are warm
+        material.model(backend).match_pairs(material.pairs(min(plan.beams), "cold")[:1])  # loads code and warms caches
     tasks = [_simulated(plan, material, b, mode, s) for b in plan.backends for mode in MODES for s in settings_of(plan, b)]
     _, beams, threads = plan.centre
     sets = {SIMULATED: {mode: material.pairs(beams, mode) for mode in MODES}}

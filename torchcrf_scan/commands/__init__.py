@@ -1,1 +1,1 @@
-"""The subcommands of `torchcrf-scan`, a module each: typed functions whose signature and docstring are their options."""
+"""The subcommands of `torchcrf-scan`, one module each: typed functions whose options come from signature and docstring."""

@@ -1,4 +1,4 @@
-"""What several commands make of their arguments: files, the batches that they are matched in, folders, a model."""
+"""Handling of arguments common to several commands: files, batches, folders, the model."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from torchcrf_scan.scan import ScanPair
 
 Item = TypeVar("Item")
 
-BATCH = 16  # pairs that are matched at once
+BATCH = 16  # pairs matched at once
 
 
 def load_model(name: str, candidates: int | None = None, device: str = "cpu", threads: int | None = None) -> JointScanCRF:
-    """A saved model, ready on a device; a damaged one, a device that is not there or no threads raise ValueError."""
+    """A saved model on a device; raises ValueError for a damaged one, a missing device or an invalid number of threads."""
     if threads is not None:
         if threads < 1:
             raise ValueError(f"--threads: expected at least 1, got {threads}")
@@ -40,7 +40,7 @@ def load_model(name: str, candidates: int | None = None, device: str = "cpu", th
 
 @dataclass(frozen=True, slots=True)
 class PairPlace:
-    """Where a pair is found: in a file of its own, or at a number of a log."""
+    """Location of a pair: a file of its own, or a number in a log."""
 
     path: Path
     log: Recording | None = None
@@ -55,19 +55,19 @@ class PairPlace:
         return str(self.path) if self.log is None else f"{self.path}, pair {self.number}"
 
     def read(self) -> ScanPair:
-        """The pair itself."""
+        """Reads the pair."""
         return read_pair(self.path) if self.log is None else self.log[self.number]
 
 
 def find_files(patterns: Sequence[str]) -> list[Path]:
-    """The files that match, each once; two of the same name raise ValueError: predictions are named like their pairs."""
+    """The matching files, each once; raises ValueError for two of the same name, as predictions are named like their pairs."""
     return [place.path for place in _each_once(PairPlace(path) for path in PairFiles(*patterns).paths)]
 
 
 def find_pairs(patterns: Sequence[str], every: int, failures: list[str]) -> list[PairPlace]:
-    """The pairs of the files that match, each once, of logs every N-th; two of the same name raise ValueError.
+    """The pairs of the matching files, each once, of logs every N-th; raises ValueError for two of the same name.
 
-    A log that cannot be read has none, then `failures` gets the reason.
+    A log that cannot be read contributes none; the reason is added to `failures`.
     """
     paths = PairFiles(*patterns).paths
     if every < 1:
@@ -84,7 +84,7 @@ def find_pairs(patterns: Sequence[str], every: int, failures: list[str]) -> list
 
 
 def read_one(file: str, number: int | None) -> ScanPair:
-    """The pair of a pair file, which has no number, or one of the pairs of a log."""
+    """The pair of a pair file (number None), or one of the pairs of a log."""
     if reader_of(file) is None:
         if number is not None:
             raise ValueError(f"--number: expected none but with a log ({ENDINGS}), got {number} with {file}")
@@ -105,7 +105,7 @@ def _each_once(places: Iterable[PairPlace]) -> list[PairPlace]:
 
 
 def make_folder(option: str, folder: str | Path) -> Path:
-    """The folder, made if need be; one that cannot be made raises ValueError, which names the option that asked for it."""
+    """Creates the folder if necessary; raises ValueError, with the name of its option, if that fails."""
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:

@@ -1,4 +1,4 @@
-"""`torchcrf-scan bench`: what the model costs, beside rivals and beside what the machine could do."""
+"""`torchcrf-scan bench`: costs of the model, compared with rivals and with the limit of the machine."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ def bench(
 ) -> int:
     """Times whole pairs, learning and rivals, measures memory, and gives the distance from the limit of this machine.
 
-    Everything is timed in turns and given as medians, on simulated streets, cold (no prior motion) and warm (the true one, as
-    wrong as odometry). Rivals that are installed run in the same turns (`pip install torchcrf-scan[bench]`). Tables are
+    Everything is timed in turns and given as medians, on simulated streets, cold (no prior motion) and warm (the true one with
+    the errors of odometry). Installed rivals run in the same turns (`pip install torchcrf-scan[bench]`). Tables are
     printed, all rows are written.
 
     Args:
         output: JSON file of the report
         model: folder of a saved model, or the name of one that the package ships
         pairs: annotated pair files, folders or glob patterns, to time recorded pairs as well
-        backends: compiled, eager; all that run here where absent
+        backends: compiled, eager; by default all that run here
         beams: numbers of beams, as a list [181,361]
         batches: numbers of pairs at once
         threads: numbers of threads of torch
-        repeats: times that every pair is timed, if three seconds are enough for that
+        repeats: times that every pair is timed, within three seconds
         simulated: simulated pairs of every number of beams
         training_pairs: pairs that one fold is fitted on, 0: no learning
-        patience: seconds of a call from which on it is left out
-        full: the reference (eager) in all sizes too, else in those that differ in one thing alone
-        beside: folder of another checkout of the package; then only the calls that both have are timed, in turns
+        patience: maximum seconds of a call; longer ones are skipped
+        full: the reference (eager) in all sizes too, by default only in those that differ in one value
+        beside: folder of another checkout of the package; then only the calls common to both are timed, in turns
     """
     from torchcrf_scan.benchmark.limits import measure_rates
     from torchcrf_scan.benchmark.plan import Plan, choose_backends
@@ -75,7 +75,7 @@ def bench(
 
 
 def _compare(plan: Plan, other: Path) -> list[Row]:
-    """The rows of this package beside another checkout."""
+    """The rows of the comparison with another checkout."""
     from torchcrf_scan.benchmark.beside import compare
     from torchcrf_scan.benchmark.scenes import street_pairs
 

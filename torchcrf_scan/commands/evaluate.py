@@ -1,4 +1,4 @@
-"""`torchcrf-scan evaluate`: the tables of predictions, from files or made here by a method."""
+"""`torchcrf-scan evaluate`: the tables of predictions, read from files or made by a method."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ Item = TypeVar("Item")
 Method = Callable[[Sequence[ScanPair]], list[PairPrediction]]
 Loader = Callable[[], JointScanCRF]
 
-FAR_TRANSLATION, FAR_ROTATION = 0.2, 0.02  # metres, radians: an ego motion found although the frames are displaced
+FAR_TRANSLATION, FAR_ROTATION = 0.2, 0.02  # metres, radians: success bounds of the ego motion with displaced frames
 
 
 def one_by_one(match: Callable[[ScanPair], PairPrediction]) -> Callable[[Loader], Method]:
-    """A baseline that takes one pair."""
+    """A method from a baseline of single pairs."""
     return lambda load: lambda pairs: [match(pair) for pair in pairs]
 
 
@@ -61,25 +61,25 @@ def evaluate(
     device: str = "cpu",
     threads: int | None = None,
 ) -> int:
-    """Prints how good predictions of annotated pairs are: an overview, the paper's Tables I to III, how sure; by sequence, in all.
+    """Scores predictions of annotated pairs: an overview, the paper's Tables I to III, calibration; by sequence and in all.
 
-    The predictions are read from files, or made here by a method. With `--frame_offset` or `--frame_turn` every second scan is
-    given to the method (joint or start) in another frame, of which it is not told; what it finds is scored in the pair's own
-    frames, and a table tells how often the ego motion is within 20 cm and 0.02 rad all the same.
+    The predictions are read from files, or made by a method. With `--frame_offset` or `--frame_turn` the method (joint or
+    start) gets every second scan in another frame, without knowing the displacement; its results are scored in the pair's own
+    frames, and a table shows how often the ego motion is within 20 cm and 0.02 rad all the same.
 
     Args:
         pair_files: pair files with annotation
         predictions: folder of prediction files named like the pair files, instead of a method
-        method: joint (the model, where absent), start (its start and nearest points, no field), static (nothing moves), background
+        method: joint (the model, default), start (its start and nearest points, no field), static (nothing moves), background
             (one registration, all of it background), icp (the paper's) or ransac (registration, then movers by RANSAC)
-        model: folder of a saved model, or the name of one that the package ships; simulated where absent
-        json: file for all figures with all digits
+        model: folder of a saved model, or the name of one that the package ships; simulated by default
+        json: file for all metrics with all digits
         frame_offset: metres by which the second scan's frame is displaced, exactly, in a random direction
         frame_turn: radians by which it is turned, exactly, to a random side; or any, uniform over the whole circle
         seed: seed of the random directions and sides
-        candidates: target points considered for each source point, 0 for all; as the model was saved where absent
+        candidates: target points considered for each source point, 0 for all; by default as the model was saved
         device: device that torch computes on, e.g. cpu or cuda
-        threads: number of threads that torch computes with; its own choice where absent
+        threads: number of threads that torch computes with; by default its own choice
     """
     from torchcrf_scan.evaluation.metrics import score_pair
     from torchcrf_scan.evaluation.report import report
@@ -108,7 +108,7 @@ def evaluate(
 
 
 def _displacement(metres: float | None, turn: Turn | None, predictions: str | None) -> FrameOffset | None:
-    """What `--frame_offset` and `--frame_turn` ask for, the absent one being 0."""
+    """The displacement from `--frame_offset` and `--frame_turn`, a missing one being 0; None without either."""
     if metres is None and turn is None:
         return None
     if predictions is not None:
@@ -154,7 +154,7 @@ def _in_batches(method: Callable[[Sequence[Item]], list[PairPrediction]], items:
 
 
 def _displaced_table(displacement: FrameOffset, rows: dict[str, list[PairScore]]) -> Table:
-    """How often the ego motion is found from afar."""
+    """Share of ego motions found with displaced frames."""
     from torchcrf_scan.evaluation.report import Table
 
     heading = f"ego within {100 * FAR_TRANSLATION:.0f} cm and {FAR_ROTATION:g} rad (%)"
@@ -163,14 +163,14 @@ def _displaced_table(displacement: FrameOffset, rows: dict[str, list[PairScore]]
 
 
 def _displaced_figures(displacement: FrameOffset, seed: int, scores: Sequence[PairScore]) -> dict[str, Any]:
-    """What `--json` writes besides: the displacement and the share found from afar."""
+    """Additional entries of `--json`: the displacement and the share of ego motions found."""
     sequences = {sequence: _found_from_afar(part) for sequence, part in _by_sequence(scores).items()}
     found = {"all": _found_from_afar(scores), "sequences": sequences}
     return {"displaced": {"metres": displacement.metres, "turn": displacement.turn, "seed": seed, "ego_success": found}}
 
 
 def _found_from_afar(scores: Sequence[PairScore]) -> float:
-    """Percentage of the known ego motions that are found to within `FAR_TRANSLATION` and `FAR_ROTATION`."""
+    """Percentage of the known ego motions found within `FAR_TRANSLATION` and `FAR_ROTATION`."""
     known = [score for score in scores if score.has_ego_truth]
     return 100 * sum(score.has_ego_within(FAR_TRANSLATION, FAR_ROTATION) for score in known) / max(len(known), 1)
 
@@ -181,13 +181,13 @@ def _by_sequence(scores: Sequence[PairScore]) -> dict[str, list[PairScore]]:
 
 
 def _rows(name: str, scores: list[PairScore]) -> dict[str, list[PairScore]]:
-    """Row of a table -> its scores: every sequence, where there are several, then all."""
+    """Row of a table -> its scores: every sequence, if there are several, then all."""
     rows = {f"{name}, {sequence or 'no sequence'}": part for sequence, part in _by_sequence(scores).items()}
     return {**(rows if len(rows) > 1 else {}), f"{name}, all": scores}
 
 
 def _figures(name: str, scores: list[PairScore]) -> dict[str, Any]:
-    """What `--json` writes: `method`, `all` and `sequences`, every figure of `summarise`, null where there is nothing to tell."""
+    """Entries of `--json`: `method`, `all` and `sequences`, every metric of `summarise`, null for missing values."""
     from torchcrf_scan.evaluation.summary import summarise
 
     def figures(part: Sequence[PairScore]) -> dict[str, float | None]:

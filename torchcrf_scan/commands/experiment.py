@@ -17,7 +17,7 @@ from torchcrf_scan.experiment.settings import RunConfig
 def experiment(*, ablations: str | None = None, **settings: Any) -> int:
     """Leaves pairs, then sequences, out in turn; fits every method on the rest; prints Tables I to III with intervals.
 
-    A killed run goes on where it was. Under `torchrun` every process takes its share of the folds.
+    An interrupted run is resumed. Under `torchrun` every process takes its share of the folds.
 
     Args:
         ablations: folder of YAML files, each a variant of the settings; only the joint model is run, one table is printed
@@ -49,7 +49,7 @@ def experiment_parser(summary: str) -> ArgumentParser:
 
 
 def read_variants(folder: Path, config: RunConfig) -> dict[str, RunConfig]:
-    """The variants of `config` in a folder: one a YAML file, or with `experiment.leave_out` one for each feature named there.
+    """The variants of `config` in a folder: one per YAML file, or with `experiment.leave_out` one for each feature named there.
 
     Raises:
         ValueError: no YAML file, or one with unknown settings.

@@ -1,4 +1,4 @@
-"""Bad input, told in one line each."""
+"""Bad input, reported in one line each."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Result = TypeVar("Result")
 
 
 def attempt(failures: list[str], run: Callable[..., Result], *arguments: Any) -> Result | None:
-    """What `run` returns, None where the input is bad; then `failures` gets the reason."""
+    """The result of `run`; None for bad input, and then the reason is added to `failures`."""
     try:
         return run(*arguments)
     except (ValueError, OSError) as error:
@@ -18,5 +18,5 @@ def attempt(failures: list[str], run: Callable[..., Result], *arguments: Any) ->
 
 
 def one_line(error: Exception) -> str:
-    """Its message without line breaks."""
+    """The message of an error without line breaks."""
     return " ".join(str(error).split())

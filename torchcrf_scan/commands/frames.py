@@ -1,6 +1,6 @@
-"""Pairs whose second scan is given in another frame: how well a method finds a motion that nothing prepared it for.
+"""Pairs whose second scan is in another frame: a test of methods with large unknown motions.
 
-The method never learns of the displacement; what it finds is given back in the pair's own frames, to be scored like any other.
+The method does not know the displacement; its results are transformed to the pair's own frames, to be scored like any other.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ METHODS: Mapping[str, Callable[[JointScanCRF, ScanPairBatch], Prediction]] = {
 
 @dataclass(frozen=True, slots=True)
 class FrameOffset:
-    """How far the second scans' frames are displaced.
+    """Displacement of the second scans' frames.
 
     Attributes:
         metres: exact distance, in a random direction.
@@ -58,7 +58,7 @@ class FrameOffset:
         return f"displaced by {self.metres:g} m and {turn}"
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """(count, 3) motions of the second scans' points into their new frames, float64; a pair's is the same whatever `count`."""
+        """(count, 3) motions of the second scans' points into their new frames, float64; a pair's does not depend on `count`."""
         direction, side = (2 * math.pi * torch.rand(count, 2, dtype=torch.float64, generator=generator) - math.pi).unbind(-1)
         theta = side if self.turn == "any" else torch.full_like(side, self.turn).copysign(side)
         return torch.stack([theta, self.metres * direction.cos(), self.metres * direction.sin()], dim=-1)
@@ -66,7 +66,7 @@ class FrameOffset:
 
 @torch.no_grad()
 def match_displaced(method: str, model: JointScanCRF, pairs: Sequence[tuple[ScanPair, Tensor]]) -> list[PairPrediction]:
-    """The answers of a method for pairs displaced by an offset (3,) each, in the pairs' own frames."""
+    """Predictions of a method for pairs displaced by an offset (3,) each, in the pairs' own frames."""
     reference = next(model.parameters())
     own = [pair for pair, _ in pairs]
     offset = torch.stack([offset for _, offset in pairs]).to(reference)  # (B, 3)
@@ -80,7 +80,7 @@ def match_displaced(method: str, model: JointScanCRF, pairs: Sequence[tuple[Scan
 
 
 def turned(uncertainty: Uncertainty, angle: Tensor) -> Uncertainty:
-    """The same in target frames turned by angle (B,) radians; where their origin lies does not matter."""
+    """The same in target frames rotated by angle (B,) radians; independent of their origin."""
     none, one = torch.zeros_like(angle), torch.ones_like(angle)
     rows = ((one, none, none), (none, angle.cos(), -angle.sin()), (none, angle.sin(), angle.cos()))
     turn = torch.stack([torch.stack(row, -1) for row in rows], -2)[:, None]  # (B, 1, 3, 3)

@@ -1,4 +1,4 @@
-"""`torchcrf-scan match`: predictions of pair files and logs by a saved model, a file and a line a pair."""
+"""`torchcrf-scan match`: predictions of pair files and logs by a saved model, one file and one line per pair."""
 
 from __future__ import annotations
 
@@ -30,20 +30,19 @@ def match(
     device: str = "cpu",
     threads: int | None = None,
 ) -> int:
-    """Matches scan pairs: writes OUTPUT/<name of the pair>.npz for each and prints how the sensor and the movers went.
+    """Matches scan pairs: writes OUTPUT/<name of the pair>.npz for each and prints the motions of the sensor and the movers.
 
     A pair is a file, or two consecutive readings of a log; those of run.log are named run_00000, run_00001 and so on. Earlier
-    predictions are replaced, other files never. What cannot be read or written does not stop the others; it is reported at the
-    end.
+    predictions are replaced, other files never. Files that cannot be read or written are skipped and reported at the end.
 
     Args:
         files: pair files and logs
-        output: folder of the prediction files, made if need be
+        output: folder of the prediction files, created if necessary
         every: takes each N-th pair of a log only
         model: folder of a saved model, or the name of one that the package ships
-        candidates: target points considered for each source point, 0 for all; as the model was saved where absent
+        candidates: target points considered for each source point, 0 for all; by default as the model was saved
         device: device that torch computes on, e.g. cpu or cuda
-        threads: number of threads that torch computes with; its own choice where absent
+        threads: number of threads that torch computes with; by default its own choice
     """
     failures: list[str] = []
     places = find_pairs(files, every, failures)
@@ -67,7 +66,7 @@ def match(
 
 
 def _shares(moving: Sequence[tuple[int, int]]) -> str:
-    """How much moves in all: (moving, all) source points of every pair."""
+    """Overall share of moving points; moving: (moving, all) source points of every pair."""
     if not moving:
         return ""
     in_motion, points = (sum(counts) for counts in zip(*moving, strict=True))
@@ -88,7 +87,7 @@ def describe(pair: ScanPair, prediction: PairPrediction) -> str:
 
 
 def _unobserved(prediction: PairPrediction) -> str:
-    """What of the background's motion nothing was seen of, directions being those of the second scan's frame."""
+    """The unobserved part of the background's motion, in words; directions are in the second scan's frame."""
     turn, shift = prediction.unobserved_turn, prediction.unobserved_shift
     found = "; turn not observed" if turn is not None and turn[BACKGROUND] else ""
     if shift is not None and shift[BACKGROUND].any():
@@ -102,7 +101,7 @@ def _signed(value: float, digits: int) -> str:
 
 
 def mover_speeds(pair: ScanPair, prediction: PairPrediction) -> list[float]:
-    """Speed over ground of every mover, m/s, where its centroid goes."""
+    """Speed over ground of every mover's centroid, m/s."""
     points = pair.source.to_beams(pair.source.points, np.nan)
     background, *motions = prediction.motions
     centroids = [points[prediction.cluster == k].mean(axis=0) for k in range(1, len(motions) + 1)]
@@ -111,7 +110,7 @@ def mover_speeds(pair: ScanPair, prediction: PairPrediction) -> list[float]:
 
 
 def _match_batch(network: JointScanCRF, pairs: Mapping[str, ScanPair], failures: list[str]) -> dict[str, PairPrediction]:
-    """The predictions; where the batch fails, those of each pair alone, so that a bad one does not lose the others."""
+    """The predictions; if the batch fails, each pair alone, so that a bad one does not affect the others."""
     try:
         return dict(zip(pairs, network.match_pairs(list(pairs.values())), strict=True))
     except (ValueError, RuntimeError) as error:
@@ -122,7 +121,7 @@ def _match_batch(network: JointScanCRF, pairs: Mapping[str, ScanPair], failures:
 
 
 def _prediction_path(name: str, folder: Path) -> Path:
-    """Where the prediction of a pair goes: nothing there yet, or an earlier prediction."""
+    """Path of the prediction of a pair; it must not exist, or be an earlier prediction."""
     target = folder / f"{name}.npz"
     if target.exists():
         try:

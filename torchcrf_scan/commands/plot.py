@@ -9,12 +9,12 @@ from torchcrf_scan.data.pair_file import read_prediction
 
 
 def plot(file: str, output: str, *, number: int | None = None, prediction: str | None = None, model: str | None = None) -> int:
-    """Draws a pair with its prediction, from a file or by a model, and its annotation, as far as they are there.
+    """Draws a pair with its prediction, from a file or by a model, and its annotation, if there are any.
 
     Args:
         file: pair file, or log
         output: picture (.png) to write
-        number: which pair of the log, counted from 0 as in the names of its pairs
+        number: number of a pair of the log, counted from 0 as in the names of its pairs
         prediction: prediction file
         model: folder of a saved model, or the name of one that the package ships; matches the pair
     """

@@ -13,11 +13,11 @@ def simulate(output: str, simulator: SimulatorConfig, *, pairs: int = 31, sequen
     Files of an earlier run are replaced. A folder that would then hold other .npz files beside those of this run is refused.
 
     Args:
-        output: folder of the pair files, made if need be
+        output: folder of the pair files, created if necessary
         simulator: world and sensor
         pairs: number of pairs in all
         sequences: number of drives that they come from
-        seed: seed of everything drawn
+        seed: seed of all random draws
     """
     from torchcrf_scan.data.simulate import simulate_pairs
 

@@ -1,1 +1,1 @@
-"""Data."""
+"""Readers and writers of pairs, recordings and predictions, and the simulator."""

@@ -14,9 +14,9 @@ import numpy as np
 
 from torchcrf_scan.scan import Floats, Scan, ScanPair
 
-NO_RETURN = 50.0  # metres from which on a reading means that nothing came back (SICK LMS: 51 or 81.9)
-FIELD_OF_VIEW = math.pi  # of the front laser; the format does not say
-TAIL = 9  # fields behind the ranges
+NO_RETURN = 50.0  # metres; larger readings are beams without return (SICK LMS: 51 or 81.9)
+FIELD_OF_VIEW = math.pi  # of the front laser; not stated in the format
+TAIL = 9  # number of fields after the ranges
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +26,8 @@ class CarmenScan:
     Attributes:
         scan: the valid returns.
         stamp: seconds.
-        pose: (x, y, theta) of the sensor, metres and radians; corrected where the log is.
-        odometry: (x, y, theta) as the wheels tell it.
+        pose: (x, y, theta) of the sensor, metres and radians; corrected if the log is.
+        odometry: (x, y, theta) from the wheels.
     """
 
     scan: Scan
@@ -37,17 +37,17 @@ class CarmenScan:
 
 
 class CarmenLog(Sequence[ScanPair]):
-    """The pairs of consecutive readings of the front laser, in the order of the file; pairs are made when asked for.
+    """The pairs of consecutive readings of the front laser, in the order of the file; pairs are made on demand.
 
     Args:
         path: log file, `.gz` or not.
-        no_return: metres from which on a reading means that nothing came back.
+        no_return: metres; larger readings are beams without return.
 
     Attributes:
-        scans: all S readings; there are S - 1 pairs, none where S < 2.
+        scans: all S readings; there are S - 1 pairs, none if S < 2.
 
     Raises:
-        ValueError: a file that cannot be read, without readings, or with a reading of another form; names file and line.
+        ValueError: a file that cannot be read, without readings, or with a malformed reading; names file and line.
     """
 
     def __init__(self, path: str | Path, *, no_return: float = NO_RETURN) -> None:
@@ -77,17 +77,17 @@ class CarmenLog(Sequence[ScanPair]):
         return ScanPair(source.scan, target.scan, seconds, name=name, sequence=sequence, origin=self.path.name)
 
     def pair_name(self, number: int) -> str:
-        """The name of a pair: the log's and its number."""
+        """The name of a pair: that of the log and its number."""
         return f"{log_name(self.path)}_{number:05d}"
 
 
 def log_name(path: Path) -> str:
-    """The name of a recording: the file's, without `.log` and `.gz`."""
+    """The name of a recording: that of the file, without `.log` and `.gz`."""
     return path.name.removesuffix(".gz").removesuffix(".log")
 
 
 def read_text(path: Path) -> str:
-    """The whole file. Raises ValueError for one that is not there or not text."""
+    """Contents of a text file. Raises ValueError if it is missing or not text."""
     try:
         data = path.read_bytes()
         return (gzip.decompress(data) if path.suffix == ".gz" else data).decode("utf-8", errors="replace")

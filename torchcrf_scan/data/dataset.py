@@ -17,7 +17,7 @@ from torchcrf_scan.scan import ScanPair
 
 
 class PairFiles(Sequence[ScanPair]):
-    """The pair files that match any of the patterns, sorted by path, each read when first asked for and then kept.
+    """The pair files that match any of the patterns, sorted by path, each read on first access and then cached.
 
     Args:
         patterns: files, folders (all their `*.npz`) or glob patterns (`**` for any depth); a file found twice counts once.
@@ -26,7 +26,7 @@ class PairFiles(Sequence[ScanPair]):
         paths: the files.
 
     Raises:
-        ValueError: no pattern, or one that matches nothing; from indexing also what `read_pair` raises.
+        ValueError: no pattern, or one without matches; indexing also raises the errors of `read_pair`.
     """
 
     def __init__(self, *patterns: str | Path) -> None:
@@ -70,9 +70,9 @@ def split_by_sequence(pairs: Sequence[ScanPair], held_out: int | float, seed: in
 
     Args:
         pairs: pairs; those without a `sequence` count as one recording.
-        held_out: number of recordings to test on (int), or the share of the pairs in (0, 1) that the randomly drawn test
-            recordings reach at least (float), as far as one recording is left to train on.
-        seed: which recordings are drawn.
+        held_out: number of recordings to test on (int), or minimum share of the pairs in (0, 1) in the randomly drawn test
+            recordings (float), as long as one recording is left to train on.
+        seed: of the draw of recordings.
 
     Returns:
         (train, test), each in the order of `pairs`, neither empty.
@@ -92,7 +92,7 @@ def split_by_sequence(pairs: Sequence[ScanPair], held_out: int | float, seed: in
 
 
 def _held_out_count(sizes: list[int], held_out: int | float) -> int:
-    """How many of the recordings, in this order, are held out; always between 1 and all but one."""
+    """Number of recordings, in this order, that are held out; always between 1 and all but one."""
     if isinstance(held_out, int | np.integer) and not isinstance(held_out, bool):
         if not 1 <= held_out < len(sizes):
             raise ValueError(f"held_out: expected a number of sequences in [1, {len(sizes) - 1}], got {held_out}")

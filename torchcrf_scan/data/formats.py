@@ -1,4 +1,4 @@
-"""The formats of recordings, each known by the end of its name: one file and one line each. Other files are pair files."""
+"""Formats of recordings by file suffix: one file and one line each. All other files are pair files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchcrf_scan.scan import ScanPair
 
 
 class Recording(Protocol):
-    """A sequence of the pairs of consecutive scans."""
+    """A sequence of pairs of consecutive scans."""
 
     def __len__(self) -> int: ...
     @overload
@@ -20,15 +20,15 @@ class Recording(Protocol):
     def __getitem__(self, index: slice) -> Sequence[ScanPair]: ...
 
     def pair_name(self, number: int) -> str:
-        """The name of a pair: the recording's and its number."""
+        """The name of a pair: that of the recording and its number."""
 
 
-FORMATS: Mapping[str, Callable[[str | Path], Recording]] = {".log": CarmenLog, ".log.gz": CarmenLog}  # by the end of the name
+FORMATS: Mapping[str, Callable[[str | Path], Recording]] = {".log": CarmenLog, ".log.gz": CarmenLog}  # by suffix
 ENDINGS = ", ".join(FORMATS)
 
 
 def reader_of(path: str | Path) -> Callable[[str | Path], Recording] | None:
-    """What reads a recording of this name; None: it is none."""
+    """The reader of a recording by its suffix; None for other files."""
     name = Path(path).name
     return next((read for ending, read in FORMATS.items() if name.endswith(ending)), None)
 
@@ -37,7 +37,7 @@ def read_recording(path: str | Path) -> Recording:
     """A recording with at least one pair.
 
     Raises:
-        ValueError: another name, a file that cannot be read, or fewer than two scans.
+        ValueError: an unknown suffix, a file that cannot be read, or fewer than two scans.
     """
     read = reader_of(path)
     if read is None:

@@ -1,9 +1,9 @@
-"""Pair files and prediction files: one `.npz` of plain arrays per scan pair, the contract with other programs.
+"""Pair files and prediction files: one `.npz` of plain arrays per scan pair, the interface to other programs.
 
 A pair file holds `source_ranges`, `source_bearings` (N,), `target_ranges`, `target_bearings` (M,), `dt` and, optionally, the
 annotation (`association`, `cluster`, `body`, `ignore` (N,), `motions` (K+1, 3)), the sensor (`range_min`, `range_max`,
 `range_noise`) and the texts `sequence` and `source` (`ScanPair.origin`). A prediction file holds the fields of `PairPrediction`.
-Both number beams: an index is an entry of the file's arrays, also where invalid returns lie between. Unknown keys are ignored.
+Both count beams: an index is an entry of the file's arrays, including invalid returns. Unknown keys are ignored.
 
 Writing is atomic and checked by the reader's own rules; the same content gives the same bytes.
 """
@@ -40,7 +40,7 @@ _PREDICTION_KEYS = ("association", "cluster", "motions", "association_confidence
 
 @dataclass(frozen=True, slots=True)
 class _Fields:
-    """The arrays of one file with the checks on them: every error names file, key, expected and got."""
+    """The arrays of one file with their checks: every error names file, key, expected and actual value."""
 
     path: Path
     arrays: dict[str, NDArray[Any]]
@@ -52,7 +52,7 @@ class _Fields:
         raise ValueError(f"{self.path}: {key}: expected {expected}, got {got}")
 
     def get(self, key: str, kind: str, *shape: int | str) -> NDArray[Any]:
-        """The array `key`, of a kind of number and a shape (a name fits any length), converted to the package's dtype."""
+        """The array `key` of a given kind of number and shape (a name fits any length), converted to the package's dtype."""
         if key not in self.arrays:
             self.fail(key, "this key", "a file without it")
         array = self.arrays[key]
@@ -65,7 +65,7 @@ class _Fields:
         return array.astype(dtype, order="C")
 
     def require(self, key: str, values: NDArray[Any], is_right: NDArray[Any] | bool, expected: str) -> None:
-        """Fails at the first entry of `values` that is not right."""
+        """Raises ValueError for the first entry of `values` that is not right."""
         wrong = np.argwhere(~np.asarray(is_right))
         if len(wrong):
             where = tuple(int(i) for i in wrong[0])
@@ -99,9 +99,9 @@ class _Fields:
 def read_pair(path: str | Path) -> ScanPair:
     """Reads a pair file; the pair's name is the file's name without suffix.
 
-    Without `body` it is `cluster`, without `ignore` nothing is ignored, without `motions` every cluster that occurs has a NaN
-    row. Beams without a valid return count as ignored. Without `association` and `cluster` the pair has no annotation and the
-    other keys of the annotation are not looked at.
+    Missing keys: `body` is `cluster`, nothing is ignored, and `motions` are NaN for every cluster that occurs. Beams without a
+    valid return count as ignored. Without `association` and `cluster` the pair has no annotation and the other keys of the
+    annotation are not read.
 
     Raises:
         ValueError: not an `.npz`, truncated, object arrays, a key that is missing or wrong (the message names it).
@@ -111,13 +111,13 @@ def read_pair(path: str | Path) -> ScanPair:
 
 
 def write_pair(path: str | Path, pair: ScanPair) -> None:
-    """Writes a pair file: all beams, NaN ranges where a beam returned nothing.
+    """Writes a pair file: all beams, with NaN ranges for beams without return.
 
     `Scan` does not keep the bearings of such beams: they are interpolated between their neighbours (held at the ends). The
     pair's name is not written, it is the file's.
 
     Raises:
-        ValueError: a pair that `read_pair` would refuse, or scans of different sensors. No file is written.
+        ValueError: a pair that `read_pair` would reject, or scans of different sensors. No file is written.
     """
     fields = _Fields(Path(path), _pair_arrays(Path(path), pair))
     _parse_pair(fields)
@@ -138,7 +138,7 @@ def write_prediction(path: str | Path, prediction: PairPrediction) -> None:
     """Writes a prediction file.
 
     Raises:
-        ValueError: a prediction that `read_prediction` would refuse. No file is written.
+        ValueError: a prediction that `read_prediction` would reject. No file is written.
     """
     keys = [key for key in (*_PREDICTION_KEYS, *_CERTAINTY_KEYS) if getattr(prediction, key) is not None]
     fields = _Fields(Path(path), {key: np.asarray(getattr(prediction, key), order="C") for key in keys})
@@ -183,7 +183,7 @@ def _parse_annotation(fields: _Fields, source: Scan, target: Scan) -> Annotation
     is_return, is_target_return = _is_return(source), _is_return(target)
     association = fields.labels("association", n, target.n_beams)
     fields.require("association", association, is_return | (association < 0), "-1 for a beam without a valid return")
-    reaches = np.append(is_target_return, True)[association]  # (N,), the outlier's -1 picks the appended True
+    reaches = np.append(is_target_return, True)[association]  # (N,), the outlier's -1 indexes the appended True
     fields.require("association", association, reaches, "indices of valid returns of the target")
 
     stop = len(fields.motions()) if "motions" in fields else None
@@ -251,20 +251,20 @@ def _pair_arrays(path: Path, pair: ScanPair) -> dict[str, NDArray[Any]]:
 
 def _annotation_arrays(annotation: Annotation, is_return: Bools) -> dict[str, NDArray[Any]]:
     arrays = {key: np.asarray(getattr(annotation, key)) for key in _ANNOTATION_KEYS}
-    if arrays["ignore"].shape == is_return.shape:  # otherwise the reader's check tells
+    if arrays["ignore"].shape == is_return.shape:  # otherwise the reader's check raises
         arrays["ignore"] = arrays["ignore"] | ~is_return
     return arrays
 
 
 def _all_bearings(scan: Scan) -> Floats:
-    """(n_beams,) bearings, interpolated where the beam was dropped."""
+    """(n_beams,) bearings, interpolated for dropped beams."""
     if len(scan) == 0:
         return np.zeros(scan.n_beams)
     return np.interp(np.arange(scan.n_beams), scan.beam, scan.bearings)
 
 
 def _load(path: Path, keys: Sequence[str]) -> _Fields:
-    """Reads the known keys of an archive; whatever numpy or zipfile say of a damaged one becomes a ValueError."""
+    """Reads the known keys of an archive; errors of numpy and zipfile for a damaged one are raised as ValueError."""
     with open(path, "rb") as file:
         try:
             archive = np.load(file, allow_pickle=False)
@@ -277,7 +277,7 @@ def _load(path: Path, keys: Sequence[str]) -> _Fields:
 
 
 def _save(fields: _Fields) -> None:
-    """Writes the archive beside its place and moves it there, so that nobody sees half a file."""
+    """Writes the archive atomically: to a temporary file in the same folder, then renamed."""
     path = fields.path
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     arrays: dict[str, Any] = fields.arrays

@@ -1,6 +1,6 @@
 """Simulated scan pairs with exact annotation: a laser drives through a world of `world.py`.
 
-Worlds, poses and ray casting are at full size; `SimulatorConfig.scale` shrinks ranges and motions when they are measured.
+Worlds, poses and ray casting are at full size; `SimulatorConfig.scale` is applied to measured ranges and motions.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import MAX_RANGE_MARGIN, OUTLIER, Annotation, Bools, Floats, Ints, Scan, ScanPair
 
 ORIGIN = "torchcrf_scan simulator"
-STATIC = 0  # bodies in a scan: the world, movers by their number, and returns that belong to none
+STATIC = 0  # bodies in a scan: the static world, movers by number, and returns of no single body
 NO_BODY = -1
 
-FARTHEST_WORLD = {"street": 90.0, "indoor": 25.0}  # metres that the world goes on ahead of the sensor
-TURNING_RADIUS = 4.5  # metres, the tightest of a car; robots turn on the spot
+FARTHEST_WORLD = {"street": 90.0, "indoor": 25.0}  # metres of world ahead of the sensor
+TURNING_RADIUS = 4.5  # metres, minimum of a car; robots turn on the spot
 INDOOR_SPEED = 1.5  # m/s, the fastest robot
-VIBRATION_KNOTS = np.radians(8.0)  # neighbouring beams share a jolt over about this angle
-MIXED_JUMP = (0.3, 6.0)  # metres at full size: ranges this far apart merge in one beam; farther ones give two separate echoes
-GRAZING_COSINE = 0.03  # beams that graze a surface are lost: exp(-cosine / this)
-LEAST_COSINE = 0.1  # the spacing of returns on a surface is not trusted to grow beyond ten times that of a frontal one
-GATE = 3.2  # times half the scan's usual spacing and twice its noise: annotators of recordings use one gate for a whole scan
-LEAST_MOTION = 0.02  # metres at full size: what moves less within a pair stands still
-SENSOR_CLEARANCE = 0.3  # metres that movers keep from the sensor
-LEAST_SEEN = 3  # returns of a mover when it enters
+VIBRATION_KNOTS = np.radians(8.0)  # angle over which neighbouring beams share a jolt
+MIXED_JUMP = (0.3, 6.0)  # metres at full size; ranges this far apart merge in one beam; farther ones give two separate echoes
+GRAZING_COSINE = 0.03  # loss of grazing beams: exp(-cosine / this)
+LEAST_COSINE = 0.1  # the spacing of returns on a surface is limited to ten times that at normal incidence
+GATE = 3.2  # times half the scan's usual spacing plus twice its noise; annotators of recordings use one gate for a whole scan
+LEAST_MOTION = 0.02  # metres at full size; bodies that move less within a pair are static
+SENSOR_CLEARANCE = 0.3  # metres between movers and the sensor
+LEAST_SEEN = 3  # minimum number of returns of a mover when it enters
 ENTRY_TRIES = {"any": 12, "truck": 80, "slider": 40}
 TRUCK_SHARE = (0.4, 0.5)  # of the returns
 
@@ -39,7 +39,7 @@ TRUCK_SHARE = (0.4, 0.5)  # of the returns
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """What every beam meets first, at full size: (B,) `ranges` (inf: nothing), `cosine` of incidence, and `body`."""
+    """The first hit of every beam, at full size: (B,) `ranges` (inf: none), `cosine` of incidence, and `body`."""
 
     ranges: Floats
     cosine: Floats
@@ -53,10 +53,10 @@ class Hits:
 
 
 def _segment_ranges(segments: Floats, directions: Floats) -> Floats:
-    """(B, S) ranges at which beams from the origin meet segments (S, 4), inf where they do not; directions: (B, 2)."""
+    """(B, S) ranges at which beams from the origin meet segments (S, 4), else inf; directions: (B, 2)."""
     a, edge = segments[:, :2], segments[:, 2:] - segments[:, :2]
     dx, dy = directions[:, :1], directions[:, 1:]
-    with np.errstate(divide="ignore", invalid="ignore"):  # parallel beams divide by zero and fail every comparison below
+    with np.errstate(divide="ignore", invalid="ignore"):  # parallel beams divide by zero and fail all comparisons below
         inverse = 1.0 / (dx * edge[:, 1] - dy * edge[:, 0])
         ranges = (a[:, 0] * edge[:, 1] - a[:, 1] * edge[:, 0]) * inverse
         along = (a[:, 0] * dy - a[:, 1] * dx) * inverse
@@ -64,7 +64,7 @@ def _segment_ranges(segments: Floats, directions: Floats) -> Floats:
 
 
 def _circle_ranges(circles: Floats, directions: Floats, rng: np.random.Generator) -> Floats:
-    """(B, C) ranges at which beams meet circles (C, 4); in leaves they end at a random depth, or pass through."""
+    """(B, C) ranges at which beams meet circles (C, 4); in foliage they end at a random depth, or pass through."""
     along = directions @ circles[:, :2].T
     half_squared = circles[:, 2] ** 2 - (circles[:, :2] ** 2).sum(1) + along**2
     half = np.sqrt(np.maximum(half_squared, 0))
@@ -87,7 +87,7 @@ def cast(shapes: Shapes, bearings: Floats, body: int, rng: np.random.Generator) 
     nearest = table.argmin(1)
     reached = table[np.arange(len(bearings)), nearest]
     nearest[np.isinf(reached)] = n_shapes
-    cosine = np.ones(len(bearings))  # leaves have no orientation
+    cosine = np.ones(len(bearings))  # foliage has no orientation
 
     on = np.flatnonzero(nearest < n_segments)
     edge = shapes.segments[nearest[on], 2:] - shapes.segments[nearest[on], :2]
@@ -103,7 +103,7 @@ def cast(shapes: Shapes, bearings: Floats, body: int, rng: np.random.Generator) 
 
 
 def _in_view(shapes: Shapes, reach: float, fov: float) -> Shapes:
-    """Leaves out what no beam can meet, shapes being in the sensor's frame: most of a long street."""
+    """Culls shapes that no beam can meet, such as most of a long street. shapes: in the sensor's frame."""
     ends = shapes.segments.reshape(-1, 2, 2)
     near = np.hypot(*(ends.mean(1)).T) < reach + np.hypot(*(ends[:, 1] - ends[:, 0]).T) / 2
     near_circles = np.hypot(shapes.circles[:, 0], shapes.circles[:, 1]) < reach + shapes.circles[:, 2]
@@ -118,15 +118,15 @@ def _in_view(shapes: Shapes, reach: float, fov: float) -> Shapes:
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """One scan and what the simulator knows of it.
+    """One scan with the state of the simulation.
 
     Attributes:
         scan: the valid returns, n of them.
-        body: (n,) what they belong to: `STATIC`, a mover's number, or `NO_BODY`.
+        body: (n,) their bodies: `STATIC`, a mover's number, or `NO_BODY`.
         spacing: (n,) metres between neighbouring returns on the surface there.
         time: seconds.
         ego: (3,) the sensor's pose in the world, at full size.
-        movers: those in the world now, seen or not.
+        movers: those in the world at this time, visible or not.
     """
 
     scan: Scan
@@ -146,7 +146,7 @@ def beam_bearings(config: SimulatorConfig) -> tuple[Floats, float]:
 
 
 def _mix_edges(ranges: Floats, body: Ints, config: SimulatorConfig, rng: np.random.Generator) -> tuple[Floats, Ints]:
-    """At some depth edges the far beam's spot lies on both surfaces and its range between them; it belongs to no body."""
+    """Mixed pixels: at some depth edges a beam returns a range between both surfaces, which belongs to no body."""
     with np.errstate(invalid="ignore"):
         jump = np.diff(ranges)  # inf - inf is nan: no edge
         is_edge = (np.abs(jump) > MIXED_JUMP[0]) & (np.abs(jump) < MIXED_JUMP[1]) & (rng.random(len(jump)) < config.mixed_pixels)
@@ -160,14 +160,14 @@ def _mix_edges(ranges: Floats, body: Ints, config: SimulatorConfig, rng: np.rand
 
 
 def _noise(bearings: Floats, config: SimulatorConfig, rng: np.random.Generator) -> Floats:
-    """(B,) range noise of the beams and the vibration that neighbours share, metres."""
+    """(B,) range noise of the beams plus the vibration shared by neighbours, metres."""
     knots = np.arange(bearings[0] - VIBRATION_KNOTS, bearings[-1] + 2 * VIBRATION_KNOTS, VIBRATION_KNOTS)
     jolts = np.interp(bearings, knots, rng.normal(0, config.vibration, len(knots)))
     return rng.normal(0, config.range_noise, len(bearings)) + jolts
 
 
 def _measure(hits: Hits, config: SimulatorConfig, rng: np.random.Generator) -> tuple[Scan, Ints, Floats]:
-    """The scan that the sensor makes of `hits`, and body and spacing (n,) of its returns."""
+    """The measured scan of `hits`, and body and spacing (n,) of its returns."""
     bearings, step = beam_bearings(config)
     ranges, body = _mix_edges(hits.ranges, hits.body, config, rng)
     ranges = config.scale * ranges + _noise(bearings, config, rng)
@@ -184,7 +184,7 @@ def _measure(hits: Hits, config: SimulatorConfig, rng: np.random.Generator) -> t
 
 
 def association_gate(spacing: Floats, config: SimulatorConfig) -> float:
-    """How far a moved return may be from its counterpart, metres; spacing: (M,) of the target scan, not empty."""
+    """Maximum distance of a moved return to its counterpart, metres; spacing: (M,) of the target scan, not empty."""
     noise = float(np.hypot(config.range_noise, config.vibration))
     return GATE * (float(np.median(spacing)) / 2 + 2 * noise)
 
@@ -205,7 +205,7 @@ def _associate(moved: Floats, body: Ints, target: Capture, target_body: Ints, co
 
 
 def annotate(source: Capture, target: Capture, config: SimulatorConfig) -> Annotation:
-    """What became of every source return, from the true motions of the sensor and of every body."""
+    """Ground truth of every source return, from the true motions of the sensor and of every body."""
     world = se2.compose(se2.inverse(target.ego), source.ego)
     motions = [world]
     label = {STATIC: 0, NO_BODY: -1}
@@ -217,7 +217,7 @@ def annotate(source: Capture, target: Capture, config: SimulatorConfig) -> Annot
             label[mover.number] = len(motions)
             to_world = se2.compose(after, se2.inverse(before))
             motions.append(se2.compose(se2.inverse(target.ego), se2.compose(to_world, source.ego)))
-    unseen = -2  # a body of the target that the source does not see
+    unseen = -2  # a body of the target that is not visible in the source
     body = np.array([label[b] for b in source.body], dtype=np.int64)
     target_body = np.array([label.get(b, unseen) for b in target.body], dtype=np.int64)
     table = np.stack(motions) * np.array([1.0, config.scale, config.scale])
@@ -231,12 +231,12 @@ def annotate(source: Capture, target: Capture, config: SimulatorConfig) -> Annot
 
 
 def _longest_step(config: SimulatorConfig) -> float:
-    """Metres at full size that the sensor travels at most per pair."""
+    """Maximum travel of the sensor per pair, metres at full size."""
     return config.ego_translation if config.scene == "street" else min(config.ego_translation, INDOOR_SPEED * config.dt)
 
 
 def _ego_path(config: SimulatorConfig, world: World, pairs: int, is_straight: bool, rng: np.random.Generator) -> Floats:
-    """(pairs + 1, 3) poses of the sensor along the world: a steady speed, and as wild a turn as keeps it on its way."""
+    """(pairs + 1, 3) poses of the sensor along the world: constant speed, and turns as large as the world allows."""
     speed = _longest_step(config) * (rng.triangular(0.0, 0.1, 1.0) if rng.random() < 0.9 else 0.0)
     limit = min(config.ego_rotation, speed / TURNING_RADIUS) if world.is_street else config.ego_rotation
     bend = limit * (0.1 if is_straight or rng.random() < 0.6 else rng.uniform(0.2, 1.0))
@@ -250,7 +250,7 @@ def _ego_path(config: SimulatorConfig, world: World, pairs: int, is_straight: bo
 
 
 def _steer(start: Floats, world: World, pairs: int, speed: float, bend: float, limit: float, rng: np.random.Generator) -> Floats:
-    """(pairs + 1, 3) poses from `start` on: random turns of about `bend` per pair, led back to the lane."""
+    """(pairs + 1, 3) poses from `start` on: random turns of about `bend` per pair, steered back to the lane."""
     pose = start + np.array([rng.normal(0, 0.3) * bend, 0.0, 0.0])
     poses, turn = [pose], bend * -np.sign(pose[2])  # a large turn leads across the road, not into the parked cars
     for _ in range(pairs):
@@ -265,7 +265,7 @@ def _steer(start: Floats, world: World, pairs: int, speed: float, bend: float, l
 
 @dataclass
 class _Drive:
-    """A sequence in the making: the world, the sensor's path (T, 3) at `times` (T,), and the kinds of movers wanted."""
+    """A sequence under construction: the world, the sensor's path (T, 3) at `times` (T,), and the kinds of movers wanted."""
 
     config: SimulatorConfig
     rng: np.random.Generator
@@ -273,11 +273,11 @@ class _Drive:
     path: Floats
     times: Floats
     kinds: list[str]
-    movers: dict[int, Mover] = field(default_factory=dict)  # by place in `kinds`
+    movers: dict[int, Mover] = field(default_factory=dict)  # by index in `kinds`
     born: int = 0
 
     def capture(self, i: int) -> Capture:
-        """Scans at time i; places whose mover was not seen in the scan before (all, at first) get a new one."""
+        """The scan at time i; movers that were not visible in the scan before (all, at first) are replaced by new ones."""
         config, rng = self.config, self.rng
         bearings, _ = beam_bearings(config)
         reach = config.range_max / config.scale
@@ -298,7 +298,7 @@ class _Drive:
         return cast(shapes, beam_bearings(self.config)[0], mover.number, self.rng)
 
     def _enter(self, place: int, kind: str, i: int, hits: Hits) -> Hits:
-        """Puts a new mover in an empty place, if one in a few tries is seen and in nobody's way; returns the new hits."""
+        """Places a new mover, if one of a few random ones is visible and unobstructed; returns the new hits."""
         step = min(i, len(self.times) - 2)
         speed = float(np.hypot(*(self.path[step + 1] - self.path[step])[1:])) / self.config.dt
         viewer = Viewer(self.path[i], speed, self.config.fov > 200)
@@ -322,14 +322,14 @@ class _Drive:
         return bool(n_mover >= min(LEAST_SEEN, self.config.beams))
 
     def _obstacles(self, i: int) -> tuple[Floats, Floats]:
-        """(O, T - i, 2) where the sensor and the other movers are from time i on, and (O, 2) their half sizes."""
+        """(O, T - i, 2) positions of the sensor and the other movers from time i on, and (O, 2) their half sizes."""
         movers = self.movers.values()
         paths = [self.path[i:, 1:], *(mover.pose(self.times[i:])[:, 1:] for mover in movers)]
         return np.stack(paths), np.stack([np.full(2, SENSOR_CLEARANCE), *(mover.half_size for mover in movers)])
 
 
 def _is_clear(mover: Mover, obstacles: tuple[Floats, Floats], times: Floats) -> bool:
-    """Whether the mover never meets an obstacle; (O, T, 2) and (O, 2) of these, at `times` (T,)."""
+    """Whether the mover never collides with an obstacle; (O, T, 2) and (O, 2) of these, at `times` (T,)."""
     paths, half_sizes = obstacles
     relative = se2.apply(se2.inverse(mover.pose(times)), paths[:, :, None])[:, :, 0]  # (O, T, 2) in the mover's frame
     reach = mover.half_size + half_sizes[:, None]

@@ -1,6 +1,6 @@
-"""The simulated worlds and what moves in them: outlines made of segments and circles, at full size.
+"""The simulated worlds and their movers: outlines made of segments and circles, at full size.
 
-A world is built along its x axis, which the sensor follows; `simulate.py` looks at it with a laser.
+A world is built along its x axis, which the sensor follows; `simulate.py` scans it with a laser.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats
 
 CAR_SPEED = (3.0, 15.0)  # m/s
-BOX_CORNER = np.array([0.0, 0.25, 0.5]) * np.pi  # a rounded corner is drawn with two chords
+BOX_CORNER = np.array([0.0, 0.25, 0.5]) * np.pi  # a rounded corner consists of two chords
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Shapes:
 
     Attributes:
         segments: (S, 4) x, y of both ends.
-        circles: (C, 4) x, y, radius and mean free path of a beam inside: 0 for a solid, more for leaves and twigs.
+        circles: (C, 4) x, y, radius and mean free path of a beam inside: 0 for a solid, more for foliage.
     """
 
     segments: Floats
@@ -42,7 +42,7 @@ class Shapes:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """What stands still, and where things may move.
+    """The static outlines, and the areas in which things may move.
 
     Attributes:
         shapes: the static outlines, world frame.
@@ -76,7 +76,7 @@ def box(length: float, width: float, radius: float = 0.0) -> Floats:
 
 
 def placed(segments: Floats, theta: float, x: float, y: float) -> Floats:
-    """The (S, 4) segments after a turn by `theta` and a shift to (x, y)."""
+    """The (S, 4) segments after a rotation by `theta` and a translation to (x, y)."""
     return se2.apply(np.array([theta, x, y]), segments.reshape(-1, 2)).reshape(-1, 4)
 
 
@@ -108,7 +108,7 @@ def _facade(rng: np.random.Generator, start: float, end: float, y: float, depth:
 
 
 def _hedge(rng: np.random.Generator, start: float, end: float, y: float) -> Floats:
-    """Overlapping bushes in a row: (C, 4) circles that let beams in."""
+    """Overlapping bushes in a row: (C, 4) circles that beams penetrate."""
     x = np.arange(start, end, 0.5)
     n = len(x)
     return np.stack([x, y + rng.normal(0, 0.12, n), rng.uniform(0.35, 0.65, n), rng.uniform(0.1, 0.3, n)], axis=1)
@@ -165,7 +165,7 @@ def _parked(rng: np.random.Generator, start: float, end: float, y: float) -> Sha
 
 
 def street(rng: np.random.Generator, start: float, end: float, clutter: float) -> World:
-    """A two-lane street from x = start to end, closed by a building at either end now and then."""
+    """A two-lane street from x = start to end, sometimes closed by a building at either end."""
     half_width = rng.uniform(3.3, 4.5)
     parts = []
     for _ in range(2):
@@ -236,7 +236,7 @@ def indoor(rng: np.random.Generator, start: float, end: float, clutter: float) -
     return World(shapes, False, half_width, 0.0, 0.7 * half_width)
 
 
-# --- what moves ---------------------------------------------------------------------------------------------------------------
+# --- movers -------------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +249,7 @@ class Mover:
         start: (3,) its pose in the world.
         shapes: its outlines in its own frame, x ahead.
         speed, turn: m/s and rad/s.
-        stride: how far the circles swing ahead and back in turn, metres; 0 for everything on wheels.
+        stride: amplitude of the alternating swing of the circles, metres; 0 for everything on wheels.
     """
 
     number: int
@@ -284,7 +284,7 @@ class Mover:
 
 @dataclass(frozen=True, slots=True)
 class Viewer:
-    """The sensor as traffic meets it: `pose` (3,) in the world, `speed` in m/s, whether it `sees_behind` itself."""
+    """The sensor's state for placing movers: `pose` (3,) in the world, `speed` in m/s, whether its view includes its rear."""
 
     pose: Floats
     speed: float
@@ -292,7 +292,7 @@ class Viewer:
 
 
 def _ahead(rng: np.random.Generator, viewer: Viewer, near: float, far: float) -> float:
-    """An x at `near` to `far` metres from the viewer, behind it too where it looks there."""
+    """An x at `near` to `far` metres from the viewer, also behind it if its view includes its rear."""
     side = -1.0 if viewer.sees_behind and rng.random() < 0.4 else 1.0
     return float(viewer.pose[1] + side * rng.uniform(near, far))
 
@@ -336,7 +336,7 @@ def _robot(rng: np.random.Generator, world: World, viewer: Viewer, number: int, 
 
 
 def _beside(rng: np.random.Generator, world: World, viewer: Viewer, number: int, time: float, kind: str) -> Mover:
-    """A `truck` or a `slider` (a car of which one side shows) abreast of the sensor, on the same course."""
+    """A `truck` or a `slider` (a car of which one side is visible) next to the sensor, on the same course."""
     size = 1.0 if world.is_street else 0.25
     is_truck = kind == "truck"
     length = size * (rng.uniform(8, 14) if is_truck else rng.uniform(4, 5.5))

@@ -1,4 +1,4 @@
-"""Settings of the simulator, and the worlds that are made with them."""
+"""Settings of the simulator, and the named worlds made with them."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class SimulatorConfig:
         fov: field of view, degrees; 360 is a closed scan.
         range_min: nearest return.
         range_max: farthest return.
-        range_noise: standard deviation of a return.
-        dropout: share of beams that return nothing although they hit something.
+        range_noise: standard deviation of a range.
+        dropout: share of beams without return although they hit something.
         mixed_pixels: share of the depth edges where a beam returns a range between the near and the far surface.
-        vibration: standard deviation of the sensor's pitch and jolts, seen as extra range noise common to neighbouring beams.
+        vibration: standard deviation of the sensor's pitch and jolts, as range noise common to neighbouring beams.
         dt: seconds between the scans of a pair.
         ego_translation: largest travel of the sensor per pair, before `scale`; indoors never more than 1.5 m/s.
-        ego_rotation: largest turn of the sensor per pair, radians.
-        movers_min: least number of moving objects; a pair has fewer where some are out of sight.
+        ego_rotation: largest rotation of the sensor per pair, radians.
+        movers_min: least number of moving objects; a pair has fewer if some are out of sight.
         movers_max: largest number of moving objects.
         clutter: amount of hedges, bushes and low crowns, whose returns are not repeatable; 2 is an ordinary street.
         dominant_mover: probability that a truck drives beside the sensor and fills 40 to 50 % of the returns of a sequence.

@@ -1,1 +1,1 @@
-"""A small convolutional encoder over the points of a scan, which says what of them moves and what has no counterpart."""
+"""A small convolutional encoder over the points of a scan: learned log potentials of movers and outliers."""

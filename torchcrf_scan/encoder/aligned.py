@@ -1,7 +1,7 @@
-"""What the encoder sees of a point: its surroundings in its own scan, and the other scan where the present motions carry it.
+"""Input channels of the encoder: a point's surroundings in its own scan, and the other scan aligned by the present motions.
 
-Everything is free of scale: lengths are measured in what a beam covers at the point's range, and noise; angles in beam steps. All
-of it is looked up along the beams, so the cost is linear in the points (design finding 15).
+All channels are free of scale: lengths in units of beam footprint at the point's range and noise; angles in beam steps. All
+are looked up along the beams, so the cost is linear in the points (design finding 15).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Side:
 
     Attributes:
         points: (B, P, 2), mask: (B, P), sweep: of the scan. other, other_sweep: (B, Q, 2) points and sweep of the other scan.
-        motions: (B, C, 3). log_odds: (B, C) of there being such a mover. reach: (B, P, C); None: within `NEAR` units of it.
+        motions: (B, C, 3). log_odds: (B, C) of the existence of each mover. reach: (B, P, C); None: within `NEAR` units of it.
     """
 
     points: Tensor
@@ -45,7 +45,7 @@ class Side:
 def aligned_inputs(batch: ScanPairBatch, start: Start, backend: str = "auto", *, both: bool = True) -> tuple[Tensor, ...]:
     """(B, N, F) the `CHANNELS` of the source points, and with `both` (B, M, F) of the target points; 0 in the padding.
 
-    start: as `initialise` gives it. backend: see `InferenceConfig`.
+    start: output of `initialise`. backend: see `InferenceConfig`.
     """
     if can_run(backend, batch.source.device):
         pairs = [pair_of(batch, b) for b in range(len(batch))]
@@ -78,7 +78,7 @@ def channels_of(side: Side) -> Tensor:
 
 
 def own_channels(side: Side) -> tuple[Tensor, Tensor]:
-    """(B, P, 8) what a scan says of its own points, and (B, P) the unit of length at each."""
+    """(B, P, 8) channels from the scan itself, and (B, P) the unit of length at each point."""
     sweep = side.sweep
     ranges = torch.where(side.mask, sweep.ranges, 0.0)
     bearings = torch.where(side.mask, sweep.bearings, 0.0)
@@ -100,7 +100,7 @@ def own_channels(side: Side) -> tuple[Tensor, Tensor]:
 
 
 def cross_channels(side: Side, moved: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
-    """(B, P, 10) what the other scan says of points under the background's motion, and (B, C, P) units to its nearest point.
+    """(B, P, 10) channels from the other scan under the background's motion, and (B, C, P) units to its nearest point.
 
     moved: (B, C, P, 2) points under every motion. unit: (B, P).
     """
@@ -133,7 +133,7 @@ def cross_channels(side: Side, moved: Tensor, unit: Tensor) -> tuple[Tensor, Ten
 
 
 def best_mover(side: Side, distance: Tensor) -> tuple[Tensor, Tensor]:
-    """(B, P) units to the other scan under the best mover, and how probable the most probable mover is that comes near.
+    """(B, P) units to the other scan under the best mover, and the probability of the most probable mover near the point.
 
     distance: (B, C, P) units under every motion.
     """
@@ -147,7 +147,7 @@ def best_mover(side: Side, distance: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def along_scan(sweep: Sweep, place: Tensor) -> tuple[Tensor, Tensor]:
-    """Real points at places (B, ...) along a scan, round a closed one, and where there are such."""
+    """Real points at indices (B, ...) along a scan, wrapped round a closed one, and whether they exist."""
     extra = (1,) * (place.dim() - 1)
     count = sweep.count.view(-1, *extra)
     closed = sweep.closed.view(-1, *extra) & (count > 0)
@@ -157,5 +157,5 @@ def along_scan(sweep: Sweep, place: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def squash(values: Tensor) -> Tensor:
-    """Small values as they are but for a factor, large ones by their logarithm, signed."""
+    """Signed compression: nearly linear for small values, logarithmic for large ones."""
     return torch.asinh(values) / 2

@@ -1,4 +1,4 @@
-"""Input channels of the encoder, one scan at a time, point by point; `encoder.aligned` without batches."""
+"""Input channels of the encoder as loops, one scan at a time; same as `encoder.aligned` without batches."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OWN, CROSS = len(BESIDE) + 4, 2 * PROFILE + 4
 
 @kernel
 def along_scan(sweep: Sweep, place: int) -> int:
-    """The point at a place along a scan, round a closed one; -1 where there is none."""
+    """The point at an index along a scan, wrapped round a closed one; -1 if there is none."""
     count = len(sweep.ranges)
     if sweep.is_closed and count > 0:
         return place % count
@@ -106,7 +106,7 @@ def channels_of(
 ) -> Array:
     """(P, F) the channels of one scan's points.
 
-    points: (P, 2), other: (Q, 2). motions: (C, 3) into the other's frame. log_odds: (C,). reach: (P, C), or (0, C): what is near.
+    points: (P, 2), other: (Q, 2). motions: (C, 3) into the other's frame. log_odds: (C,). reach: (P, C), or (0, C): by distance.
     """
     P, C = len(points), len(motions)
     channels = np.zeros((P, WIDTH))
@@ -152,7 +152,7 @@ def channels_of_side(pair: Pair, motions: Array, log_odds: Array, reach: Boolean
 def aligned_inputs_of_pairs(
     pairs: Sequence[Pair], starts: Sequence[PairStart], lengths: tuple[int, int], *, both: bool = True
 ) -> tuple[Tensor, ...]:
-    """`encoder.aligned.aligned_inputs` of some pairs, in double precision, padded to so many source and target points."""
+    """`encoder.aligned.aligned_inputs` of some pairs, in double precision, padded to the given numbers of points."""
 
     def channels_of_pair(b: int) -> list[Array]:
         pair, start = pairs[b], starts[b]

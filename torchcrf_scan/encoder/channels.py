@@ -1,22 +1,22 @@
-"""The channels that the encoder sees of a point, and what they are measured with; for tensors and loops alike."""
+"""Input channels of the encoder and their constants; shared by tensors and loops."""
 
 from __future__ import annotations
 
-BESIDE = (-2, -1, 1, 2)  # points of its own scan that a point is compared with
+BESIDE = (-2, -1, 1, 2)  # neighbours in its own scan with which a point is compared
 
-WINDOW = 6  # beams of the other scan to each side, among which the nearest point is looked for
+WINDOW = 6  # beams of the other scan to each side that are searched for the nearest point
 
-PROFILE = 3  # of them that are shown to the encoder one by one
+PROFILE = 3  # number of them that are channels of their own
 
-FARTHEST = 20.0  # units; farther is all the same
+FARTHEST = 20.0  # units; larger distances are clipped
 
-LARGEST_TURN = 5.0  # beam steps, likewise
+LARGEST_TURN = 5.0  # beam steps; larger angles are clipped
 
-NOWHERE = 2.5  # stands for a difference of ranges where there is no other point
+NOWHERE = 2.5  # replaces a difference of ranges if there is no other point
 
-NEAR = 3.0  # units within which a mover counts where nobody knows its reach
+NEAR = 3.0  # units; distance within which a mover counts if its reach is unknown
 
-LONGEST_CHORD = 4.0  # units; neighbouring points farther apart are no surface between them
+LONGEST_CHORD = 4.0  # units; neighbouring points farther apart do not form a surface
 
 CHANNELS = (
     *(f"range of the point {k:+d} beside" for k in BESIDE),

@@ -1,4 +1,4 @@
-"""The network: residual convolutions of growing reach along the beams, round a closed scan."""
+"""The network: residual dilated convolutions along the beams, circular for closed scans."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from torchcrf_scan.loops.pair import Pair, PairStart
 
 @dataclass(frozen=True, slots=True)
 class Encoded:
-    """What the encoder says of B pairs.
+    """Output of the encoder for B pairs.
 
     Attributes:
         extra: log potentials of the source points.
-        source_embedding: (B, N, E), target_embedding: (B, M, E); None: it makes none.
+        source_embedding: (B, N, E), target_embedding: (B, M, E); None: without embeddings.
     """
 
     extra: ExtraLogUnary
@@ -33,9 +33,9 @@ class Encoded:
 
 
 class ScanEncoder(nn.Module):
-    """Log potentials and embeddings of points from `aligned_inputs`; before it has learned anything its potentials are 0.
+    """Log potentials and embeddings of points from `aligned_inputs`; before training its potentials are 0.
 
-    Gradients reach its own weights; what it sees of scans and motions has none.
+    Gradients reach its own weights; its inputs have none.
     """
 
     def __init__(self, config: EncoderConfig) -> None:
@@ -49,7 +49,7 @@ class ScanEncoder(nn.Module):
         nn.init.zeros_(self.last.bias)
 
     def forward(self, batch: ScanPairBatch, start: Start, backend: str = "auto") -> Encoded:
-        """What it says of a batch under the motions of a start. backend: of `aligned_inputs`."""
+        """Output for a batch under the motions of a start. backend: of `aligned_inputs`."""
         source, *target = aligned_inputs(batch, start, backend, both=self.embedding > 0)
         logits = self.encode(source.to(self.last.weight), batch.source_mask, batch.source_closed).to(source)
         extra = ExtraLogUnary(outlier=logits[..., 0], moving=logits[..., 1])
@@ -77,7 +77,7 @@ class ScanEncoder(nn.Module):
 
 
 class Layer(nn.Module):
-    """A depthwise convolution of three points, then a mixture of the channels, beside what came in; ends get shorter."""
+    """A residual layer: a depthwise convolution of three taps, then a linear mixture of the channels; shortens both ends."""
 
     def __init__(self, width: int, dilation: int) -> None:
         super().__init__()
@@ -96,7 +96,7 @@ class Layer(nn.Module):
 
 
 def unroll(values: Tensor, mask: Tensor, closed: Tensor, reach: int) -> Tensor:
-    """(B, P + 2 reach, F) the real points with `reach` more at both ends: a closed scan goes on round, an open one in zeros.
+    """(B, P + 2 reach, F) the real points extended by `reach` at both ends: circular for a closed scan, zeros for an open one.
 
     values: (B, P, F). mask: (B, P). closed: (B,).
     """

@@ -1,1 +1,1 @@
-"""Evaluation."""
+"""Metrics of predictions, and tables of methods."""

@@ -1,7 +1,7 @@
 """95 % intervals for the difference of two methods on the same pairs, by a paired bootstrap.
 
-A resample is a row of weights, how often each pair is drawn, and both methods are put together with the same weights. Pairs of
-one recording are alike, so they are not drawn one by one but with their sequence, or with their neighbours in time.
+A resample is a row of weights, how often each pair is drawn; both methods are averaged with the same weights. Pairs of
+one recording are correlated, so they are drawn with their whole sequence, or in blocks of consecutive pairs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Interval:
 
     Attributes:
         difference: over all pairs, percentage points.
-        low, high: bounds, percentage points; NaN when the resamples cannot tell.
+        low, high: bounds, percentage points; NaN if undetermined.
     """
 
     difference: float
@@ -38,9 +38,9 @@ class Interval:
 
 
 def by_sequence(sequences: Sequence[str], resamples: int = 10_000, seed: int = 0) -> Ints:
-    """Draws as many whole sequences as there are, with replacement: what other recordings would have given.
+    """Draws as many whole sequences as there are, with replacement: the variation between recordings.
 
-    A single sequence can only be drawn whole, all resamples are then the same and `paired_intervals` gives NaN bounds.
+    With a single sequence all resamples are the same and `paired_intervals` gives NaN bounds.
 
     Args:
         sequences: P names, the sequence of each pair.
@@ -60,10 +60,10 @@ def by_sequence(sequences: Sequence[str], resamples: int = 10_000, seed: int = 0
 
 
 def by_blocks(sequences: Sequence[str], block: int = 5, resamples: int = 10_000, seed: int = 0) -> Ints:
-    """Draws moving blocks of consecutive pairs within each sequence, with replacement: the same recordings at other moments.
+    """Draws moving blocks of consecutive pairs within each sequence, with replacement: the variation within recordings.
 
-    Blocks are drawn until the sequence has its length again, and the last one is cut to it. A sequence of at most `block` pairs is
-    one block and never varies.
+    Blocks are drawn up to the length of the sequence, and the last one is cut to it. A sequence of at most `block` pairs is one
+    block and never varies.
 
     Args:
         sequences: P names, the sequence of each pair; the pairs of a sequence are in the order of time.
@@ -87,14 +87,14 @@ def by_blocks(sequences: Sequence[str], block: int = 5, resamples: int = 10_000,
 
 
 def paired_intervals(ours: Sequence[PairScore], theirs: Sequence[PairScore], weights: Ints) -> dict[str, Interval]:
-    """How much higher the figures of one method are than those of another, with 95 % percentile intervals.
+    """Differences of the metrics of two methods with 95 % percentile intervals.
 
-    The figures are those of `summary.summarise`, with 0 for a share of nothing, in the resamples too. When all resamples are the
-    same they say nothing about the spread, and the bounds are NaN. O(R P) time.
+    The metrics are those of `summary.summarise`, with 0 for an empty denominator, in the resamples too. If all resamples are the
+    same the spread is undetermined, and the bounds are NaN. O(R P) time.
 
     Args:
         ours, theirs: scores of the same P pairs in the same order.
-        weights: (R, P) how often each pair is drawn, of `by_sequence` or `by_blocks`.
+        weights: (R, P) how often each pair is drawn, from `by_sequence` or `by_blocks`.
 
     Returns:
         `association_within_2`, `association_accuracy`, `cluster_accuracy`, `iou_moving`, `movers_found` and `ego_success`: ours
@@ -117,7 +117,7 @@ def paired_intervals(ours: Sequence[PairScore], theirs: Sequence[PairScore], wei
 
 
 def _share(part: float, whole: float) -> tuple[float, float]:
-    """A share of one pair as summand of a mean over pairs, 0 of nothing."""
+    """Numerator and denominator of one pair in a mean of shares over pairs; an empty share counts as 0."""
     return (part / whole if whole else 0.0), 1.0
 
 
@@ -130,7 +130,7 @@ def _good_ego(score: PairScore) -> tuple[float, float]:
     return score.has_ego_truth and score.has_ego_within(EGO_TRANSLATION, EGO_ROTATION), score.has_ego_truth
 
 
-_SHARES: dict[str, Callable[[PairScore], tuple[float, float]]] = {  # a figure is 100 * sum of first / sum of second
+_SHARES: dict[str, Callable[[PairScore], tuple[float, float]]] = {  # a metric is 100 * sum of first / sum of second
     "association_within_2": lambda score: _share(score.within_2, score.association.points),
     "association_accuracy": lambda score: _share(score.association.right, score.association.points),
     "cluster_accuracy": lambda score: _share(score.cluster.right, score.cluster.points),
@@ -141,7 +141,7 @@ _SHARES: dict[str, Callable[[PairScore], tuple[float, float]]] = {  # a figure i
 
 
 def _figures(scores: Sequence[PairScore], weights: Ints) -> Floats:
-    """(R, F) percentages of the weighted pairs, 0 of nothing."""
+    """(R, F) percentages over the weighted pairs, 0 for an empty denominator."""
     shares = np.array([[share(score) for share in _SHARES.values()] for score in scores], dtype=np.float64)  # (P, F, 2)
     parts, wholes = (weights.astype(np.float64) @ shares[..., i] for i in (0, 1))  # (R, P) @ (P, F) -> (R, F)
     return np.divide(100.0 * parts, wholes, out=np.zeros_like(parts), where=wholes > 0)

@@ -1,4 +1,4 @@
-"""Whether confidences and covariances mean what they say: calibration error, reliability, normalised estimation error."""
+"""Calibration of confidences and consistency of covariances: calibration error, reliability, normalised estimation error."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ MOTION_FREEDOM = 3  # theta, tx, ty
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Answers given with confidences from `low` to `high`, the latter belonging to the next bin.
+    """Predictions with confidences from `low` (included) to `high` (excluded).
 
     Attributes:
         low, high: bounds of the confidence.
-        count: answers in the bin.
-        confidence: their mean confidence. accuracy: share of them that is right. Both NaN for none.
+        count: predictions in the bin.
+        confidence: their mean confidence. accuracy: share of right ones. Both NaN for an empty bin.
     """
 
     low: float
@@ -61,7 +61,7 @@ def reliability(confidence: ArrayLike, is_right: ArrayLike, bins: int = BINS) ->
 
 
 def expected_calibration_error(confidence: ArrayLike, is_right: ArrayLike, bins: int = BINS) -> float:
-    """Mean over all answers of |confidence - accuracy| of their bin; NaN for no answers. Arguments as in `reliability`."""
+    """Mean over all predictions of |confidence - accuracy| of their bin; NaN for empty input. Arguments as in `reliability`."""
     table = [row for row in reliability(confidence, is_right, bins) if row.count]
     if not table:
         return float("nan")
@@ -69,12 +69,12 @@ def expected_calibration_error(confidence: ArrayLike, is_right: ArrayLike, bins:
 
 
 def normalised_error(estimate: Floats, truth: Floats, covariance: Floats) -> Floats:
-    """NEES e^T P^-1 e of motions, a chi-square number of three degrees of freedom if the covariance P is right.
+    """NEES e^T P^-1 e of motions; chi-square distributed with three degrees of freedom if the covariance P is right.
 
     estimate, truth: (..., 3). covariance: (..., 3, 3). Returns (...,), NaN where the truth is.
     """
     error = np.concatenate([se2.wrap(estimate[..., :1] - truth[..., :1]), estimate[..., 1:] - truth[..., 1:]], axis=-1)
-    scale = np.sqrt(np.einsum("...ii->...i", covariance))  # radians and metres of all sizes: solve for the correlations
+    scale = np.sqrt(np.einsum("...ii->...i", covariance))  # normalises radians and metres, so that the system is well conditioned
     correlation = covariance / (scale[..., :, None] * scale[..., None, :])
     scaled = (error / scale)[..., None]
     return (scaled * np.linalg.solve(correlation, scaled)).sum((-1, -2))
@@ -82,12 +82,12 @@ def normalised_error(estimate: Floats, truth: Floats, covariance: Floats) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """What many normalised errors say of their covariances.
+    """Consistency of covariances with many normalised errors.
 
     Attributes:
-        count: errors.
-        mean: their mean; low, high: where 95 % of such means lie if the covariances are right.
-        median: over the median of the chi-square distribution.
+        count: number of errors.
+        mean: of the errors; low, high: 95 % interval of this mean under right covariances.
+        median: divided by the median of the chi-square distribution.
         within: share of the errors below its 95 % quantile.
     """
 
@@ -100,7 +100,7 @@ class Consistency:
 
 
 def consistency(nees: ArrayLike, freedom: int = MOTION_FREEDOM, level: float = 0.95) -> Consistency:
-    """Compares normalised errors (P,) with the chi-square distribution. Raises ValueError for none."""
+    """Compares normalised errors (P,) with the chi-square distribution. Raises ValueError for empty input."""
     values = np.asarray(nees, dtype=np.float64)
     if values.ndim != 1 or not len(values):
         raise ValueError(f"nees: expected at least one number (P,), got {values.shape}")
@@ -118,12 +118,12 @@ def consistency(nees: ArrayLike, freedom: int = MOTION_FREEDOM, level: float = 0
 
 @dataclass(frozen=True, slots=True)
 class Rightness:
-    """Which answers of a pair are right, by valid return of the source.
+    """Right and wrong labels of a pair, by valid return of the source.
 
     Attributes:
-        known: (N,) returns that somebody annotated; the others do not count.
-        exact: (N,) the true target beam, or an outlier that is one.
-        within: (N,) at most `tolerance` target beams off, or an outlier that is one.
+        known: (N,) annotated returns; the others are not scored.
+        exact: (N,) the true target beam, or a true outlier.
+        within: (N,) at most `tolerance` target beams off, or a true outlier.
         cluster: (N,) the true cluster, movers matched by overlap.
     """
 
@@ -149,12 +149,12 @@ def rightness(pair: ScanPair, prediction: PairPrediction, tolerance: int = 2) ->
 
 @dataclass(frozen=True, slots=True)
 class Sureness:
-    """How sure the answer for a pair was, beside whether it was right: P returns that somebody annotated.
+    """Confidences of a pair's labels and whether these are right: P annotated returns.
 
     Attributes:
         association, cluster: (P,) confidences.
         association_right, cluster_right: (P,) bool; an association is right within two target beams.
-        nees: normalised error of the background's motion; NaN where the method gives no covariance or a motion is unknown.
+        nees: normalised error of the background's motion; NaN without covariance or if a motion is unknown.
     """
 
     association: Floats
@@ -178,7 +178,7 @@ class Sureness:
 
 
 def background_nees(pair: ScanPair, prediction: PairPrediction) -> float:
-    """Normalised error of the background's motion; NaN where there is none to tell."""
+    """Normalised error of the background's motion; NaN if undefined."""
     if pair.annotation is None or prediction.covariances is None:
         return float("nan")
     covariance, motions = prediction.covariances[BACKGROUND], (prediction.motions[BACKGROUND], pair.annotation.motions[BACKGROUND])

@@ -1,4 +1,4 @@
-"""Which mover of one answer is which of another, by the points that they share."""
+"""Matching of the movers of two labellings by overlap."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchcrf_scan.scan import BACKGROUND, Ints
 def match_movers(cluster: Ints, predicted: Ints) -> dict[int, int]:
     """Matches movers one to one by maximum total overlap; matches without any overlap are left out (spec 8.2, A-22).
 
-    Clusters enter in the order of their first point, so that their numbers do not matter, not even in a tie.
+    Clusters are ordered by their first point, so that the result does not depend on their numbers, not even in a tie.
 
     Args:
         cluster: (N,) true labels.
@@ -29,7 +29,7 @@ def match_movers(cluster: Ints, predicted: Ints) -> dict[int, int]:
 
 
 def relabel(predicted: Ints, cluster: Ints, matched: dict[int, int]) -> Ints:
-    """(N,) predicted labels in the numbers of the true ones; unmatched movers get numbers that no true one has."""
+    """(N,) predicted labels renumbered like the matched true ones; unmatched movers get numbers unused by the truth."""
     out = predicted.copy()
     number = {theirs: ours for ours, theirs in matched.items()}
     free = int(cluster.max(initial=0)) + 1
@@ -42,7 +42,7 @@ def relabel(predicted: Ints, cluster: Ints, matched: dict[int, int]) -> Ints:
 
 
 def movers_in_order(labels: Ints) -> Ints:
-    """(K,) movers that occur, in the order of their first point."""
+    """(K,) numbers of the movers, in the order of their first point."""
     ids, first = np.unique(labels, return_index=True)
     ids = ids[np.argsort(first)]
     return ids[ids > BACKGROUND]

@@ -1,6 +1,6 @@
-"""Metrics that are a part of a whole, both counted pair by pair: one function and one line each.
+"""Metrics that are ratios, numerator and denominator counted pair by pair: one function and one line each.
 
-A line of `MEASURES` is all that a metric needs: `score_pair` counts it, `summarise` averages it, and its table shows it.
+A new metric needs only a line in `MEASURES`: `score_pair` counts it, `summarise` averages it, and its table shows it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from torchcrf_scan.scan import Bools, Floats, Ints, ScanPair
 
-Count = tuple[float, float]  # a part, and the whole that it is a part of
+Count = tuple[float, float]  # numerator and denominator
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +20,8 @@ class Labelled:
     """The scored source beams of a pair, S of them, in the order of the beams.
 
     Attributes:
-        pair: what they belong to. association, cluster: (S,) true labels; body: (S,) what the point is on.
-        predicted_association: (S,); predicted_cluster: (S,) as the method numbers them.
+        pair: their pair. association, cluster: (S,) true labels; body: (S,) true body.
+        predicted_association: (S,); predicted_cluster: (S,) as numbered by the method.
     """
 
     pair: ScanPair
@@ -43,7 +43,7 @@ class Measure:
 
     Attributes:
         count: of one pair. heading, digits: of its column.
-        is_pooled: parts and wholes of all pairs are summed first; otherwise it is a mean over pairs, in percent.
+        is_pooled: numerators and denominators of all pairs are summed first; otherwise it is a mean over pairs, in percent.
     """
 
     count: Callable[[Labelled], Count]

@@ -1,7 +1,7 @@
-"""How good a prediction of one pair is: its counts and errors (spec 8, A-21 to A-23, A-27). `summary` puts many together.
+"""Scores of a prediction of one pair: counts and errors (spec 8, A-21 to A-23, A-27). `summary` averages over pairs.
 
-Only valid returns that somebody annotated are scored. Indices are beams, as in the files, so the figures are those of the
-pair and prediction files themselves. Movers are matched to the true ones by maximum overlap, background and outlier are fixed.
+Only valid annotated returns are scored. Indices are beams, as in pair and prediction files. Movers are matched to the true
+ones by maximum overlap, background and outlier are fixed.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from torchcrf_scan.evaluation.measures import EVERY, Count, Labelled
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 
-MOVER_MIN_POINTS = 5  # a mover with fewer inlier points is not asked to be found
+MOVER_MIN_POINTS = 5  # movers with fewer inlier points are not counted in the detection rate
 FOUND_IOU = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class LabelScore:
-    """A string of predicted labels against the true one, in points.
+    """Predicted labels compared with the true ones, in points.
 
     Attributes:
         points: scored points.
         right: points with the true label, the outlier being a label (spec 8.1, 8.2).
         sed1, sed2: edit distances of the strings with substitutions at cost 1 and 2 (spec 8.3).
-        outliers_predicted, outliers_true, outliers_both: points called outlier, that are, and both (spec 8.4).
+        outliers_predicted, outliers_true, outliers_both: predicted outliers, true outliers, and both (spec 8.4).
     """
 
     points: int
@@ -48,7 +48,7 @@ class MotionError:
     Attributes:
         rotation: radians.
         translation: metres, at the sensor's origin.
-        centroid: metres by which the object's centroid lands wrong (free of the choice of origin).
+        centroid: error of the object's moved centroid, metres (independent of the choice of origin).
     """
 
     rotation: float
@@ -58,7 +58,7 @@ class MotionError:
 
 @dataclass(frozen=True, slots=True)
 class ObjectScore:
-    """A true object (background or mover) against the predicted cluster matched to it.
+    """A true object (background or mover) and the predicted cluster matched to it.
 
     Attributes:
         cluster: the true object's number, 0 for the background.
@@ -81,7 +81,7 @@ class ObjectScore:
 
     @property
     def is_counted(self) -> bool:
-        """Whether it is a mover large enough to be asked for."""
+        """Whether it is a mover large enough to count in the detection rate."""
         return self.is_mover and self.points >= MOVER_MIN_POINTS
 
     @property
@@ -97,18 +97,18 @@ class ObjectScore:
 
 @dataclass(frozen=True, slots=True)
 class PairScore:
-    """Everything that is measured on one pair; `summary.summarise` turns many into the figures of a table.
+    """All scores of one pair; `summary.summarise` averages them over pairs.
 
     Attributes:
         association: score of the associations.
         cluster: score of the cluster labels after matching.
-        within_1, within_2: points at most 1, 2 target beams off; an outlier must be called one.
-        counts: part and whole of every one of `measures.EVERY`.
-        moving_both, moving_either: points moving by truth and prediction, by truth or prediction, among those whose `body` counts.
+        within_1, within_2: points at most 1, 2 target beams off; true outliers must be predicted as outliers.
+        counts: numerator and denominator of each of `measures.EVERY`.
+        moving_both, moving_either: points moving by truth and prediction, by truth or prediction, among those of known `body`.
         has_ego_truth: whether the background's true motion is known.
         ego_rotation, ego_translation: error of the background motion, radians and metres; NaN when it or its truth is unknown.
         objects: background and movers that have inlier points.
-        sureness: how sure the prediction was of what. Takes no part in comparisons.
+        sureness: confidences and whether the labels were right. Ignored in comparisons.
         name, sequence: of the pair.
     """
 
@@ -128,7 +128,7 @@ class PairScore:
     sequence: str = ""
 
     def has_ego_within(self, translation: float, rotation: float) -> bool:
-        """Whether the ego motion is closer to the truth than this, metres and radians; False when unknown."""
+        """Whether the error of the ego motion is within these bounds, metres and radians; False when unknown."""
         return self.ego_translation < translation and self.ego_rotation < rotation
 
 
@@ -136,7 +136,7 @@ def score_pair(pair: ScanPair, prediction: PairPrediction) -> PairScore:
     """Scores the prediction of an annotated pair.
 
     Raises:
-        ValueError: a pair without annotation, or a prediction of another number of beams or of target beams that do not exist.
+        ValueError: a pair without annotation, or a prediction with another number of beams or with invalid target beams.
     """
     truth = _checked_annotation(pair, prediction)
     keep = pair.source.to_beams(np.ones(len(pair.source), dtype=bool), False) & ~truth.ignore
@@ -205,13 +205,13 @@ def _label_score(labels: Ints, predicted: Ints) -> LabelScore:
 
 
 def _moving(body: Ints, predicted: Ints) -> tuple[int, int]:
-    """Points moving by truth and by prediction, and by either: a point of unknown body counts when it is called moving."""
+    """Points moving by truth and prediction, and by either; a point of unknown body counts if predicted as moving."""
     is_moving, is_predicted = body > BACKGROUND, predicted > BACKGROUND
     return int((is_moving & is_predicted).sum()), int((is_moving | is_predicted).sum())
 
 
 def _motion(prediction: PairPrediction, cluster: int) -> Floats | None:
-    """The predicted motion of a cluster, None when there is no finite one."""
+    """The predicted motion of a cluster; None if missing or not finite."""
     motions = prediction.motions
     return motions[cluster] if cluster < len(motions) and np.isfinite(motions[cluster]).all() else None
 

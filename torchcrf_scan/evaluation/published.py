@@ -1,4 +1,4 @@
-"""The paper's own numbers (spec 10.1), for the rows of our tables that stand for the same method.
+"""The paper's own numbers (spec 10.1), for the rows of our tables with the same method.
 
 They were measured on pairs that are not public, so they are anchors of magnitude and order, not targets.
 """
@@ -14,8 +14,8 @@ class PublishedTable:
     """One table of the paper.
 
     Attributes:
-        columns: C headings with the digits after the point that were printed.
-        rows: method, called as in our tables -> its C numbers.
+        columns: C headings with the number of digits printed.
+        rows: method, named as in our tables -> its C numbers.
     """
 
     columns: tuple[tuple[str, int], ...]
@@ -27,7 +27,7 @@ _LABELS = (("accuracy (%)", 2), ("SED", 2), ("outliers found (%)", 2), ("outlier
 ASSOCIATION = PublishedTable(
     _LABELS,
     {
-        "ICP, tuned": (69.19, 119.10, 34.60, 11.07, 89.79),  # there 'ICP': ours is the one tuned to its share of outliers
+        "ICP, tuned": (69.19, 119.10, 34.60, 11.07, 89.79),  # 'ICP' in the paper; ours is tuned to the same share of outliers
         "CRF-Matching": (71.03, 116.16, 13.01, 11.07, 57.93),
         "joint": (74.13, 96.13, 12.96, 11.07, 73.37),
     },

@@ -1,4 +1,4 @@
-"""Tables of methods: the paper's I (association), II (detection), III (motion estimation), an overview, how sure, differences."""
+"""Tables of methods: the paper's I (association), II (detection), III (motion estimation), overview, calibration, differences."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _label_columns(prefix: str) -> tuple[Column, ...]:
 
 
 def _counted(table: str) -> tuple[Column, ...]:
-    """The columns of a table that `MEASURES` names."""
+    """The columns of a table from `MEASURES`."""
     return tuple((measure.heading, key, measure.digits) for key, measure in MEASURES[table].items())
 
 
@@ -104,11 +104,11 @@ class Table:
     """A table of numbers with a heading per column.
 
     Attributes:
-        title: what it shows.
+        title: of the table.
         columns: C headings.
-        rows: of C cells each, texts, numbers or differences with their intervals; NaN where there is nothing to tell.
+        rows: of C cells each, texts, numbers or differences with their intervals; NaN for missing values.
         digits: digits after the point per column, for `to_markdown`; none given: 2.
-        note: what one has to know to read it.
+        note: explanation printed below the title.
 
     Raises:
         ValueError: a row or `digits` of another length than `columns`.
@@ -156,7 +156,7 @@ Scores = Mapping[str, Sequence[PairScore]]
 
 
 def overview_table(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | None = None) -> Table:
-    """One row per method with the figures one looks at first, and the median of its `seconds`, the times of its pairs, if given.
+    """One row per method with the main metrics, and the median of its `seconds`, the times of its pairs, if given.
 
     Raises:
         ValueError: a method without scores.
@@ -169,7 +169,7 @@ def overview_table(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | N
 
 
 def association_table(scores: Scores, *, published: bool = False) -> Table:
-    """The paper's Table I: data association, beside the paper's numbers if asked for.
+    """The paper's Table I: data association. published: adds the paper's numbers.
 
     Raises:
         ValueError: a method without scores.
@@ -179,7 +179,7 @@ def association_table(scores: Scores, *, published: bool = False) -> Table:
 
 
 def detection_table(scores: Scores, *, published: bool = False) -> Table:
-    """The paper's Table II: motion detection, beside the paper's numbers if asked for.
+    """The paper's Table II: motion detection. published: adds the paper's numbers.
 
     Raises:
         ValueError: a method without scores.
@@ -189,7 +189,7 @@ def detection_table(scores: Scores, *, published: bool = False) -> Table:
 
 
 def estimation_table(scores: Scores, *, published: bool = False) -> Table:
-    """The paper's Table III: motion estimation, correctly clustered objects only, beside the paper's numbers if asked for.
+    """The paper's Table III: motion estimation, correctly clustered objects only. published: adds the paper's numbers.
 
     Raises:
         ValueError: a method without scores.
@@ -199,7 +199,7 @@ def estimation_table(scores: Scores, *, published: bool = False) -> Table:
 
 
 def sureness_table(scores: Scores) -> Table:
-    """Whether confidences and covariances mean what they say.
+    """Calibration of confidences and consistency of covariances.
 
     Raises:
         ValueError: a method without scores.
@@ -208,12 +208,12 @@ def sureness_table(scores: Scores) -> Table:
 
 
 def report(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | None = None, published: bool = False) -> list[Table]:
-    """The overview, the Tables I, II, III and how sure, of `{method: its scores}`, methods in the given order.
+    """The overview, the Tables I, II, III and calibration, of `{method: its scores}`, methods in the given order.
 
     Args:
         scores: of the pairs, by method.
         seconds: the time of every pair, by method, for the overview; `-` for a method that is missing.
-        published: adds the paper's numbers at the right of Tables I to III where a row has some.
+        published: adds the paper's numbers at the right of Tables I to III for rows that have some.
 
     Raises:
         ValueError: a method without scores.
@@ -224,12 +224,12 @@ def report(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | None = No
 
 
 def differences_table(reference: str, scores: Scores, weights: Ints) -> Table:
-    """How much better one method is than each other one on the same pairs, with 95 % intervals; percentage points.
+    """Differences of one method to each other one on the same pairs, with 95 % intervals; percentage points.
 
     Args:
-        reference: the method that the others are taken from.
+        reference: the method whose advantage is shown.
         scores: of the same P pairs in the same order, by method.
-        weights: (R, P) resamples of the pairs, of `bootstrap.by_sequence` or `bootstrap.by_blocks`.
+        weights: (R, P) resamples of the pairs, from `bootstrap.by_sequence` or `bootstrap.by_blocks`.
 
     Raises:
         ValueError: an unknown `reference`, scores of other pairs, or weights of another shape.
@@ -265,7 +265,7 @@ def _with_published(table: Table, published: paper.PublishedTable) -> Table:
 
 
 def _widened(table: Table, columns: Sequence[tuple[str, int]], cells: Mapping[str, tuple[float, ...]]) -> Table:
-    """The table with more columns (heading, digits) at the right: the cells of each row's method, NaN where it has none."""
+    """The table with more columns (heading, digits) at the right: the cells of each row's method, NaN for missing ones."""
     nothing = (math.nan,) * len(columns)
     return replace(
         table,
@@ -295,7 +295,7 @@ def _rounded(cell: Cell, digits: int) -> str:
 
 
 def _signless_zero(number: float, digits: int) -> float:
-    """The rounded number, zero without the minus that would look like a loss."""
+    """The rounded number; a rounded zero has no minus sign, which would suggest a loss."""
     return round(number, digits) + 0.0
 
 

@@ -1,4 +1,4 @@
-"""The figures of many pairs: their scores as means, shares and medians (spec 8, A-23)."""
+"""Averages of many pairs' scores: means, shares and medians (spec 8, A-23)."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from torchcrf_scan.evaluation.calibration import consistency, expected_calibrati
 from torchcrf_scan.evaluation.measures import EVERY, Count
 from torchcrf_scan.evaluation.metrics import LabelScore, ObjectScore, PairScore
 
-EGO_TRANSLATION, EGO_ROTATION = 0.05, 0.01745  # metres, radians (1 deg): a good ego motion
-EGO_TRANSLATION_LOOSE, EGO_ROTATION_LOOSE = 0.15, float(np.radians(0.5))  # for a truth that is itself good to about 7 cm
+EGO_TRANSLATION, EGO_ROTATION = 0.05, 0.01745  # metres, radians (1 deg): success bounds of the ego motion
+EGO_TRANSLATION_LOOSE, EGO_ROTATION_LOOSE = 0.15, float(np.radians(0.5))  # for annotations accurate to about 7 cm
 
 
 def summarise(scores: Sequence[PairScore]) -> dict[str, float]:
-    """The figures of many pairs: mean over pairs unless said otherwise; percent, metres, radians, numbers of edits.
+    """Metrics over many pairs: mean over pairs unless stated otherwise; percent, metres, radians, numbers of edits.
 
     - `pairs`, and `association_*`, `cluster_*`: `accuracy`, `sed1`, `sed2`, `outliers_found`, `outliers_true`, `recall` and
       `precision` of the outliers.
     - `association_within_1`, `association_within_2`, `association_inlier_accuracy`; `target_distance` pooled over points.
     - `iou_moving`, `movers_found` pooled over pairs; `movers`, their number.
     - `ego_success`, `ego_success_loose` over the pairs whose ego motion is known, `ego_answered` the share of them with a finite
-      answer; over these `ego_rotation_*` and `ego_translation_*`, `median`, `p95` and `mean`.
+      prediction; over these `ego_rotation_*` and `ego_translation_*`, `median`, `p95` and `mean`.
     - `motion_*`, `background_motion_*`, `mover_motion_*`: `rotation`, `translation`, `centroid` errors, pooled over the
       correctly clustered objects (A-23), and `objects`, their number.
     - `found_mover_centroid_median`: over the movers found.
     - `association_ece` (right within two target beams), `cluster_ece`: expected calibration errors, percent of all returns.
-    - `nees_pairs` whose background motion and covariance are known; over these `nees_covered`, percent within the 95 % quantile
-      of the chi-square, `nees_mean`, and `nees_low`, `nees_high`, where 95 % of such means lie if the covariances are right.
+    - `nees_pairs`: pairs with known background motion and covariance; over these `nees_covered`, percent within the 95 % quantile
+      of the chi-square, `nees_mean`, and `nees_low`, `nees_high`, the 95 % interval of this mean under right covariances.
 
     An undefined precision, recall or accuracy counts as 0; the key with `_skipped` leaves such pairs out. Keys with `_skipped`,
     `target_distance`, errors, `_ece` and `nees_` are NaN when there is nothing to average; no other key ever is.
@@ -53,12 +53,12 @@ def summarise(scores: Sequence[PairScore]) -> dict[str, float]:
 
 
 def _percent(part: float, whole: float) -> float:
-    """Percentage, 0 of nothing."""
+    """Percentage, 0 for an empty denominator."""
     return 100.0 * part / whole if whole else 0.0
 
 
 def _mean(values: Iterable[float]) -> float:
-    """Mean, NaN of nothing."""
+    """Mean, NaN for empty input."""
     array = np.fromiter(values, dtype=np.float64)
     return float(array.mean()) if len(array) else float("nan")
 
@@ -68,7 +68,7 @@ def _mean_percent(counts: Sequence[Count]) -> float:
 
 
 def _both_means(key: str, counts: Sequence[Count]) -> dict[str, float]:
-    """Mean percentage of (part, whole) with 0 for an undefined one, and with those skipped."""
+    """Mean percentage of (numerator, denominator) with 0 for an undefined one, and with those skipped."""
     return {key: _mean_percent(counts), f"{key}_skipped": _mean_percent([count for count in counts if count[1]])}
 
 
@@ -93,7 +93,7 @@ def _association_summary(scores: Sequence[PairScore]) -> dict[str, float]:
 
 
 def _counted_summary(scores: Sequence[PairScore]) -> dict[str, float]:
-    """The figures of `measures.MEASURES`."""
+    """Averages of `measures.MEASURES`."""
     found: dict[str, float] = {}
     for key, measure in EVERY.items():
         counts = [score.counts[key] for score in scores]
@@ -129,7 +129,7 @@ def _ego_summary(scores: Sequence[PairScore]) -> dict[str, float]:
 
 
 def _spread(key: str, values: list[float]) -> dict[str, float]:
-    """Median, 95th percentile and mean, NaN of nothing."""
+    """Median, 95th percentile and mean, NaN for empty input."""
     array = np.array(values or [np.nan])
     return {
         f"{key}_median": float(np.median(array)),
@@ -150,7 +150,7 @@ def _motion_summary(scores: Sequence[PairScore]) -> dict[str, float]:
 
 
 def _error_summary(prefix: str, objects: Sequence[ObjectScore], is_meant: Callable[[ObjectScore], bool]) -> dict[str, float]:
-    """Mean motion errors of the correctly clustered objects that are meant (spec 8.5)."""
+    """Mean motion errors of the correctly clustered objects selected by `is_meant` (spec 8.5)."""
     errors = [thing.error for thing in objects if thing.error is not None and thing.is_correct and is_meant(thing)]
     return {
         f"{prefix}_rotation": _mean(error.rotation for error in errors),

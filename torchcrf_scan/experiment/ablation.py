@@ -1,4 +1,4 @@
-"""The table of variants of one model, each beside the model it is a variant of, on the pairs that both were tested on."""
+"""Table of the variants of a model, each compared with the model itself on the pairs that both were tested on."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def ablation_table(
     Args:
         scores: variant -> its scores; the first is the model itself, tested on all pairs that any variant was tested on.
         seconds: variant -> the times of its pairs.
-        resample: bootstrap weights (R, P) of P scores, as `bootstrap.by_sequence` gives them.
+        resample: bootstrap weights (R, P) of P scores, see `bootstrap.by_sequence`.
     """
     model, *variants = scores
     reference = {one.name: one for one in scores[model]}

@@ -1,6 +1,6 @@
-"""Leave-one-out: folds, run in parallel over cores and machines, each on disk when it is done, so that a run can be resumed.
+"""Leave-one-out: folds run in parallel over cores and machines, each saved when it is done, so that a run can be resumed.
 
-A finished fold is a folder `PROTOCOL/FOLD/` with `METHOD/PAIR.npz` predictions and `seconds.json`; it appears whole or not at all.
+A finished fold is a folder `PROTOCOL/FOLD/` with `METHOD/PAIR.npz` predictions and `seconds.json`, written atomically.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 SECONDS = "seconds.json"
-LONGEST = 100  # bytes of a name that files are named by; of a longer one the beginning and a digest
-PATIENCE = timedelta(days=7)  # that a machine waits for the others' folds
+LONGEST = 100  # bytes of a file name; longer ones are truncated and end in a digest
+PATIENCE = timedelta(days=7)  # waiting time for the folds of other machines
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +51,10 @@ def make_folds(protocol: str, pairs: Sequence[ScanPair], tested: int, every: int
     Args:
         protocol: `leave_one_pair_out` or `leave_one_sequence_out`.
         pairs: the first `tested` are left out in turn, the others are always trained on.
-        every: of the tested pairs only every so many are.
+        every: only every so-many-th of the tested pairs is tested.
 
     Raises:
-        ValueError: fewer than two things to leave out, or two that one could not tell apart in the folder of results.
+        ValueError: fewer than two things to leave out, or two of the same name.
     """
     by_pair = protocol == "leave_one_pair_out"
     groups: dict[str, list[int]] = {}
@@ -78,7 +78,7 @@ def make_folds(protocol: str, pairs: Sequence[ScanPair], tested: int, every: int
 
 
 def file_name(name: str) -> str:
-    """A name as part of a path: never one that leads elsewhere (`..`), nor one that is too long for a file."""
+    """A name as a path component: never one that leads elsewhere (`..`), nor too long for a file."""
     whole = name.encode(errors="surrogatepass")
     short = name if len(whole) <= LONGEST else f"{name[: LONGEST // 4]}_{hashlib.sha256(whole).hexdigest()[:12]}"
     safe = re.sub(r"[^\w.+-]+", "_", short).strip("_")
@@ -88,10 +88,10 @@ def file_name(name: str) -> str:
 def run_folds(
     make_study: Callable[[int], Study], folds: Mapping[str, Sequence[Fold]], config: RunConfig, folder: Path, jobs: int
 ) -> None:
-    """Runs the folds that `folder` lacks; under `torchrun` every rank takes its share and rank 0 ends up with all of them.
+    """Runs the folds missing in `folder`; under `torchrun` every rank takes its share and rank 0 ends up with all of them.
 
     Args:
-        make_study: looks at the pairs, on so many cores; called when there is something to do.
+        make_study: surveys the pairs on a number of cores; called only if there are folds to run.
         folds: protocol -> its folds.
         jobs: processes.
     """
@@ -112,7 +112,7 @@ def run_folds(
 
 
 def run_fold(study_file: Path, protocol: str, fold: Fold, folder: Path) -> None:
-    """Fits on the fold's training pairs, asks about its test pairs and leaves the fold's folder behind."""
+    """Fits on the fold's training pairs, predicts its test pairs and writes the fold's folder."""
     torch.set_num_threads(1)
     study, config = load_study(study_file)
     variants = config.experiment.joint_variants and protocol == "leave_one_sequence_out"
@@ -123,7 +123,7 @@ def run_fold(study_file: Path, protocol: str, fold: Fold, folder: Path) -> None:
 
 @lru_cache(maxsize=1)
 def load_study(place: Path) -> tuple[Study, RunConfig]:
-    """The study of this run, written by the process that started it; a worker reads it once."""
+    """The study of this run, written by the parent process; a worker reads it once."""
     study, config = pickle.loads(place.read_bytes())
     return study, config
 
@@ -142,7 +142,7 @@ def write_fold(folder: Path, answers: Mapping[str, Mapping[str, Answer]]) -> Non
 
 @contextmanager
 def appearing(folder: Path) -> Iterator[Path]:
-    """A folder to fill that takes the place of `folder` when it is full."""
+    """A temporary folder to fill, which is renamed to `folder` at the end."""
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}")
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
@@ -153,7 +153,7 @@ def appearing(folder: Path) -> Iterator[Path]:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """A protocol's answers: the tested pairs, and by method their predictions and seconds, in the order of the pairs."""
+    """A protocol's results: the tested pairs, and by method their predictions and seconds, in the order of the pairs."""
 
     pairs: tuple[ScanPair, ...]
     predictions: dict[str, list[PairPrediction]]
@@ -161,7 +161,7 @@ class Results:
 
 
 def read_folds(folder: Path, pairs: Sequence[ScanPair], folds: Sequence[Fold]) -> Results:
-    """The answers of a protocol's finished folds in `folder`; methods that some fold lacks are left out. pairs: of the folds."""
+    """The results of a protocol's finished folds in `folder`, without methods missing in a fold. pairs: of the folds."""
     tested = sorted((k, fold) for fold in folds for k in fold.test)
     seconds = {fold.name: json.loads((folder / fold.name / SECONDS).read_text()) for fold in folds}
     of_pair = [seconds[fold.name][pairs[k].name] for k, fold in tested]
@@ -174,17 +174,17 @@ def read_folds(folder: Path, pairs: Sequence[ScanPair], folds: Sequence[Fold]) -
 
 
 def rank_and_world() -> tuple[int, int]:
-    """This process's number and how many there are, as `torchrun` tells them; (0, 1) without it."""
+    """This process's rank and the number of processes, as set by `torchrun`; (0, 1) without it."""
     return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def cores(jobs: int) -> int:
-    """Processes to start: `jobs`, or with 0 this process's share of the machine's cores."""
+    """Number of processes: `jobs`, or with 0 this rank's share of the machine's cores."""
     return jobs or max(1, cpu_count() // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def gather(folder: Path, mine: Sequence[Path]) -> None:
-    """Sends this rank's folds to rank 0, which writes those that it lacks: the machines need not share a disk."""
+    """Sends this rank's folds to rank 0, which writes the missing ones: the machines need not share a disk."""
     dist.init_process_group("gloo", timeout=PATIENCE)
     try:
         files = {fold: read_files(folder / fold) for fold in mine}
@@ -203,5 +203,5 @@ def gather(folder: Path, mine: Sequence[Path]) -> None:
 
 
 def read_files(folder: Path) -> dict[Path, bytes]:
-    """Every file below a folder, by its path from there."""
+    """Contents of all files below a folder, by relative path."""
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -33,20 +33,20 @@ from torchcrf_scan.whole_file import write_whole
 log = logging.getLogger(__name__)
 
 SETTINGS = "experiment.json"
-ALSO_TRAIN_SEED = 5_000  # of the worlds that every fold trains on, far from those that are left out
+ALSO_TRAIN_SEED = 5_000  # of the worlds that every fold trains on, far from those of the tested worlds
 ASSOCIATION_FIGURE = ("ICP, tuned", "CRF-Matching", "start + gated NN", JOINT)  # the paper's Fig. 3, and the start
 CLUSTER_FIGURE = ("K-Means (ICP)", "K-Means (CRF-Matching)", "CRF-Clustering", JOINT)  # the paper's Fig. 4
 RIVAL = "start + gated NN"
-DRAWN = 3  # sequences whose first pair is drawn where none is asked for
-LOSSES = 3  # pictures of the pairs where the joint model loses most against the rival
+DRAWN = 3  # sequences whose first pair is drawn by default
+LOSSES = 3  # number of pictures of pairs where the joint model loses most against its start
 ABLATED = "leave_one_sequence_out"
 
 
 def run_experiment(config: RunConfig) -> dict[str, list[Table]]:
-    """Runs the folds that the output folder lacks, then makes every table and figure.
+    """Runs the missing folds, then makes all tables and figures.
 
     Returns:
-        The tables of every protocol; none on the ranks of `torchrun` that only help.
+        The tables of every protocol; none on ranks of `torchrun` other than 0.
 
     Raises:
         ValueError: nothing to leave out, an unknown pair to draw, or a folder of another experiment.
@@ -75,9 +75,16 @@ def run_experiment(config: RunConfig) -> dict[str, list[Table]]:
 
 
 def run_ablations(config: RunConfig, variants: Mapping[str, RunConfig]) -> list[Table]:
-    """The joint model under every variant of `config`, sequences left out in turn, beside the model of `config` itself.
+    """The joint model under every variant of `config`, sequences left out in turn, compared with the model of `config` itself.
 
-    variants: name -> its config. Returns one table; none on the ranks that only help. Raises ValueError as `run_experiment`.
+    Args:
+        variants: name -> its config.
+
+    Returns:
+        One table; none on ranks other than 0.
+
+    Raises:
+        ValueError: as `run_experiment`.
     """
     pairs, tested = load_pairs(config)
     scores, seconds = {}, {}
@@ -97,14 +104,14 @@ def run_ablations(config: RunConfig, variants: Mapping[str, RunConfig]) -> list[
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """Studies of the same pairs, made when first asked for. kept: folder of what their variants share."""
+    """Cache of studies of the same pairs, made on demand. kept: folder of results shared by variants."""
 
     pairs: Sequence[ScanPair]
     kept: Path
     studies: dict[str, Study] = field(default_factory=dict)
 
     def study(self, config: RunConfig, jobs: int) -> Study:
-        """The study of a variant; variants that see the pairs alike share one."""
+        """The study of a variant, shared by variants with the same preprocessing."""
         looked_at = json.dumps([config.learning.seed, config.learning.disturbance])
         if looked_at not in self.studies:
             self.studies[looked_at] = replace(Study.of(self.pairs, config, jobs), kept=self.kept)
@@ -112,14 +119,14 @@ class Looks:
 
 
 def ablated(config: RunConfig, variant: RunConfig, name: str) -> RunConfig:
-    """A variant as the ablations run it: the joint model alone, on the pairs that the model of `config` is tested on."""
+    """A variant as run by the ablations: the joint model alone, on the pairs that the model of `config` is tested on."""
     every = math.lcm(config.experiment.test_every, variant.experiment.test_every)
     experiment = replace(variant.experiment, joint_alone=True, protocols=(ABLATED,), test_every=every)
     return replace(variant, experiment=experiment, output=str(Path(config.output) / "ablations" / file_name(name)))
 
 
 def run_variant(config: RunConfig, variant: RunConfig, looks: Looks, tested: int) -> Results | None:
-    """Runs the folds of one variant; None on the ranks that only help."""
+    """Runs the folds of one variant; None on ranks other than 0."""
     pairs, folder = looks.pairs, Path(variant.output)
     folds = make_folds(ABLATED, pairs, tested, variant.experiment.test_every)
     claim(folder, variant, pairs)
@@ -129,7 +136,7 @@ def run_variant(config: RunConfig, variant: RunConfig, looks: Looks, tested: int
 
 
 def load_pairs(config: RunConfig) -> tuple[list[ScanPair], int]:
-    """The annotated pairs, those that are left out in turn first, and how many these are."""
+    """The annotated pairs, the tested ones first, and the number of tested ones."""
     experiment, data = config.experiment, config.data
     patterns = (experiment.pairs,) if isinstance(experiment.pairs, str) else experiment.pairs
     tested = list(PairFiles(*patterns)) if patterns else simulate(experiment.worlds, config, data.seed)
@@ -140,18 +147,18 @@ def load_pairs(config: RunConfig) -> tuple[list[ScanPair], int]:
 
 
 def simulate(worlds: Sequence[str], config: RunConfig, seed: int) -> list[ScanPair]:
-    """Pairs of every named world, their names told apart by its number."""
+    """Pairs of every named world, with the world's number in their names."""
     data = config.data
     found = [simulate_pairs(WORLDS[world], data.pairs, data.sequences, seed + k) for k, world in enumerate(worlds)]
     return [replace(pair, name=f"{seed + k}_{pair.name}") for k, of_world in enumerate(found) for pair in of_world]
 
 
 def claim(folder: Path, config: RunConfig, pairs: Sequence[ScanPair]) -> None:
-    """Makes the folder this experiment's; refuses (ValueError) one whose folds were made with other settings or pairs."""
+    """Marks the folder as this experiment's; raises ValueError if its folds were made with other settings or pairs."""
     values = asdict(config)
     for name in ("output", "overfit", "compare_chains"):
         values.pop(name)
-    for name in ("figures", "resamples", "jobs", "leave_out", "protocols"):  # these may change from run to run
+    for name in ("figures", "resamples", "jobs", "leave_out", "protocols"):  # these may change between runs
         values["experiment"].pop(name)
     ours = json.loads(json.dumps({**values, "tested": [pair.name for pair in pairs]}))
     path = folder / SETTINGS
@@ -179,7 +186,7 @@ def differing(ours: Mapping[str, object], theirs: Mapping[str, object], prefix: 
 
 
 def find_pairs(wanted: Sequence[str], pairs: Sequence[ScanPair]) -> list[ScanPair]:
-    """The pairs named SEQUENCE:NUMBER (ValueError where there is none such); without names the first of the first sequences."""
+    """The pairs named SEQUENCE:NUMBER (ValueError for an unknown one); by default the first of the first sequences."""
     by_sequence: dict[str, list[ScanPair]] = {}
     for pair in pairs:
         by_sequence.setdefault(pair.sequence, []).append(pair)
@@ -205,13 +212,13 @@ def score(results: Results) -> dict[str, list[PairScore]]:
 
 
 def resample(scores: Sequence[PairScore], config: RunConfig) -> Ints:
-    """(R, P) bootstrap weights: over sequences for simulated pairs, over blocks of neighbours in time for recorded ones."""
+    """(R, P) bootstrap weights: over sequences for simulated pairs, over blocks of consecutive pairs for recorded ones."""
     draw = by_blocks if config.experiment.pairs else by_sequence
     return draw([one.sequence for one in scores], resamples=config.experiment.resamples)
 
 
 def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: str, config: RunConfig, run: RunLog) -> list[Table]:
-    """Overview, Tables I to III, how sure and the differences of one protocol, logged as well."""
+    """Overview, Tables I to III, calibration and differences of one protocol, logged as well."""
     tables = report(scores, seconds=seconds, published=True)
     weights = resample(scores[JOINT], config)
     tables += [differences_table(name, scores, weights) for name in (JOINT, ENCODED, EXACT) if name in scores and len(scores) > 1]

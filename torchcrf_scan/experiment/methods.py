@@ -1,4 +1,4 @@
-"""The rows of the tables: what every method answers for a pair that its models have not seen."""
+"""The rows of the tables: predictions of every method for a pair left out of its models' training."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchcrf_scan.learning.plugins import reach_of_truth
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
-HELD_ROUNDS = 10  # of the model whose motions are given
+HELD_ROUNDS = 10  # of the model with given motions
 TRUE_MOTIONS, TRUE_ASSOCIATIONS = "joint, true motions", "joint, true associations"
 METHODS = (
     *BASELINES,
@@ -32,21 +32,21 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A method's prediction and the seconds that it took, the shared start included."""
+    """A method's prediction and its run time in seconds, the shared start included."""
 
     prediction: PairPrediction
     seconds: float
 
     @classmethod
     def of(cls, run: Callable[[], PairPrediction], before: float = 0.0) -> Answer:
-        """The answer of a method. before: seconds of what it goes on from."""
+        """The answer of a method. before: seconds of the results that it builds on."""
         prediction, seconds = timed(run)
         return cls(prediction, before + seconds)
 
 
 @torch.no_grad()
 def answer(models: Models, pair: ScanPair) -> dict[str, Answer]:
-    """Every method's answer for an annotated pair, timed one by one. The truth is told to the two rows that name it alone."""
+    """Every method's answer for an annotated pair, timed one by one. Only the two oracle rows use the annotation."""
     annotated = ScanPairBatch.collate([pair])
     batch = annotated.without_truth()
     start, seconds = timed(lambda: models.joint[JOINT].initialise(batch))
@@ -61,7 +61,7 @@ def answer(models: Models, pair: ScanPair) -> dict[str, Answer]:
 
 
 def answer_baselines(case: Case, start_seconds: float) -> dict[str, Answer]:
-    """The answers of the baselines that are installed. start_seconds: that the start took."""
+    """The answers of the installed baselines. start_seconds: run time of the start."""
     found: dict[str, Answer] = {}
     for row, baseline in installed().items():
         before = found[baseline.after].seconds if baseline.after else start_seconds if baseline.from_start else 0.0
@@ -71,7 +71,7 @@ def answer_baselines(case: Case, start_seconds: float) -> dict[str, Answer]:
 
 
 def answer_told(joint: JointScanCRF, pair: ScanPair, annotated: ScanPairBatch, start: Start, seconds: float) -> dict[str, Answer]:
-    """The joint model with the true motions, and with the true associations: what the other half would do by itself."""
+    """The joint model with the true motions, and with the true associations: oracles that isolate one half of the problem."""
     batch, at_truth = annotated.without_truth(), with_motions_given(joint)
     told = with_config(joint, replace(joint.config, chains="clustering", coupling="motions"))
     associated = replace(start, association=annotated.truth.association)  # type: ignore[union-attr]
@@ -82,7 +82,7 @@ def answer_told(joint: JointScanCRF, pair: ScanPair, annotated: ScanPairBatch, s
 
 
 def timed(run: Callable[[], Result]) -> tuple[Result, float]:
-    """The result, and the seconds that it took."""
+    """The result, and its run time in seconds."""
     began = time.perf_counter()
     result = run()
     return result, time.perf_counter() - began
@@ -96,14 +96,14 @@ def with_config(model: JointScanCRF, config: ModelConfig) -> JointScanCRF:
 
 
 def with_motions_given(model: JointScanCRF) -> JointScanCRF:
-    """The same model, its motions held where they start; labels that swing have no motions to be damped, so its rounds are few."""
+    """The same model with motions fixed at the start; few rounds, as oscillating labels cannot be damped through motions."""
     rounds = min(model.config.inference.iterations, HELD_ROUNDS)
     inference = replace(model.config.inference, motion_metric="given", schedule="sweep", iterations=rounds)
     return with_config(model, replace(model.config, inference=inference))
 
 
 def true_start(batch: ScanPairBatch, found: Start) -> Start:
-    """The annotated motions of as many movers as there is room for, `batch` being annotated."""
+    """The annotated motions as a start, of as many movers as it has slots."""
     truth = true_plugins(batch, found.motions.shape[1])
     reach = reach_of_truth(truth, batch)
     association = nearest_association(batch, truth.motions, truth.active, reach)

@@ -37,7 +37,7 @@ ENCODED = "joint, encoder"
 
 @dataclass(frozen=True, slots=True)
 class Models:
-    """What was fitted on one fold. The joint models by the name of their row; the cascade and the gate only beside baselines."""
+    """The models of one fold: joint models by the name of their row; the cascade and the gate only if baselines are compared."""
 
     joint: dict[str, JointScanCRF]
     cascade: Cascade | None = None
@@ -45,11 +45,12 @@ class Models:
 
 
 def fit_models(study: Study, train: Sequence[int], config: RunConfig, variants: bool) -> Models:
-    """Refits everything on the pairs `train`: the movers' score, scales, boosters, weights, confidences, and ICP's gate.
+    """Fits everything on the pairs `train`: the movers' score, scales, boosters, weights, calibration, and ICP's gate.
 
-    Models for ablations are not calibrated: nobody asks how sure they are, and some take minutes a pair.
+    Models for ablations are not calibrated: their confidences are not evaluated, and some take minutes a pair.
 
-    variants: of the joint model as well, see `joint_variants`.
+    Args:
+        variants: fit the variants of the joint model too, see `joint_variants`.
     """
     score = study.collection.fit_score(train)
     material = study.collection.material(train, score, config.model.inference.clusters - 1, config.learning)
@@ -75,16 +76,16 @@ def fit_models(study: Study, train: Sequence[int], config: RunConfig, variants: 
 
 
 def fit_encoded(joint: JointScanCRF, pairs: Sequence[ScanPair], material: Sequence[Material], config: RunConfig) -> JointScanCRF:
-    """A model with an encoder, trained first order on the pairs and fresh ones, from `config.init` or a fitted joint model on.
+    """A model with an encoder, trained by first-order steps on the pairs and fresh ones, from `config.init` or the joint model.
 
     Raises:
-        ValueError: the config names no objective for it.
+        ValueError: the config has no first-order objective.
     """
     if not config.has_steps:
         raise ValueError("gradient.objective: expected one for a model with an encoder, got none")
     model = JointScanCRF(config.model)
     load_weights(model, config.init or joint)
-    alone = replace(config, gradient=replace(config.gradient, workers=0))  # a fold's process starts no others; same pairs
+    alone = replace(config, gradient=replace(config.gradient, workers=0))  # no workers in a fold's process; same pairs
     with TemporaryDirectory() as folder:
         train_by_gradient(model, alone, pairs, (), Store(Path(folder), {}), ALONE)
     model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
@@ -92,7 +93,7 @@ def fit_encoded(joint: JointScanCRF, pairs: Sequence[ScanPair], material: Sequen
 
 
 def joint_variants(config: RunConfig) -> list[tuple[str, ModelConfig, LearningConfig]]:
-    """Name, model and learning of the joint model fitted exactly, with both labels in one lattice, and both, where they differ."""
+    """Name, model and learning of the variants fitted exactly, with both labels in one lattice, and both, where they differ."""
     exactly = replace(config.learning, objective="likelihood", predicted_share=0.5)
     variants = [] if LOSSES[config.learning.objective].is_exact else [(EXACT, config.model, exactly)]
     if SCHEDULES[config.model.inference.schedule].takes_couplings:
@@ -103,7 +104,7 @@ def joint_variants(config: RunConfig) -> list[tuple[str, ModelConfig, LearningCo
 
 
 def features_key(study: Study, train: Sequence[int], config: RunConfig) -> str:
-    """Names everything that scales and boosters depend on: most ablations share them."""
+    """A key of all inputs of scales and boosters: most ablations share them."""
     learning, features, inference = (asdict(part) for part in (config.learning, config.model.features, config.model.inference))
     for name in ("objective", "predicted_share", "prior", "max_steps", "tolerance"):
         learning.pop(name)

@@ -1,4 +1,4 @@
-"""The command line and the YAML files of every setting of a run, for `train.py` and `torchcrf-scan experiment`."""
+"""Parser of command line and YAML files of a run, for `train.py` and `torchcrf-scan experiment`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jsonargparse import ArgumentParser, get_loader, set_loader
 
 from torchcrf_scan.experiment.settings import RunConfig
 
-MOST_VALUES, DEEPEST = 10_000, 50  # of a YAML file; ours have some fifty values, four levels deep
+MOST_VALUES, DEEPEST = 10_000, 50  # limits of a YAML file; ours have some fifty values, four levels deep
 
 
 def settings_parser(**options: Any) -> ArgumentParser:
@@ -24,22 +24,22 @@ def settings_parser(**options: Any) -> ArgumentParser:
 
 
 def config_of(settings: Mapping[str, Any]) -> RunConfig:
-    """The config from what the parser has instantiated; what it has parsed besides does not count."""
+    """The config from the instantiated settings; other arguments are ignored."""
     return RunConfig(**{name: value for name, value in settings.items() if name in RunConfig.__dataclass_fields__})
 
 
 def load_yaml(text: str) -> Any:
-    """What a YAML text says.
+    """Parses YAML text of bounded size.
 
     Raises:
-        yaml.YAMLError: no YAML, or one whose aliases, or whose depth, are beyond what settings need.
+        yaml.YAMLError: invalid YAML, or more aliases or levels than settings need.
     """
     return _bound_yaml()(text)
 
 
 @cache
 def _bound_yaml() -> Any:
-    """Has the parser refuse a text that unfolds to more than `MOST_VALUES`, as nested aliases do; returns its loader."""
+    """Makes the parser reject texts that expand to more than `MOST_VALUES`, e.g. by nested aliases; returns its loader."""
     load = get_loader("yaml")
 
     def load_bounded(text: str) -> Any:
@@ -51,15 +51,15 @@ def _bound_yaml() -> Any:
 
 
 def check_size(text: str) -> None:
-    """Raises yaml.YAMLError where a text unfolds to more values, or deeper, than settings need; takes no longer than its length."""
-    sizes: dict[str, int] = {}  # of what an alias may stand for
-    open_: list[tuple[str | None, int]] = [(None, 0)]  # anchors of what is being read, values in it so far
+    """Raises yaml.YAMLError if a text expands to more values or levels than settings need; in time linear in its length."""
+    sizes: dict[str, int] = {}  # number of values of every anchor
+    open_: list[tuple[str | None, int]] = [(None, 0)]  # anchors being read, with the values in them so far
     for event in yaml.parse(text, yaml.SafeLoader):
         anchor, count = getattr(event, "anchor", None), 0
         if isinstance(event, yaml.CollectionStartEvent):
             open_.append((anchor, 1))
             if anchor is not None:
-                sizes[anchor] = MOST_VALUES + 1  # until it is read: what holds itself has no end
+                sizes[anchor] = MOST_VALUES + 1  # until it is complete: a recursive anchor is infinite
         elif isinstance(event, yaml.CollectionEndEvent):
             anchor, count = open_.pop()
         elif isinstance(event, yaml.ScalarEvent):

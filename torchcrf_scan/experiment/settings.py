@@ -1,4 +1,4 @@
-"""Settings of the paper's experiment, beside those of a training run."""
+"""Settings of the paper's experiment, in addition to those of a training run."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from torchcrf_scan.names import WEIGHTS
 
 @dataclass(frozen=True)
 class ExperimentConfig:
-    """The paper's experiment, `torchcrf-scan experiment`: every pair is tested by models that have not seen it.
+    """The paper's experiment, `torchcrf-scan experiment`: every pair is tested by models trained without it.
 
     Attributes:
         pairs: a file, folder or glob pattern of the annotated pairs, or a list of them; none: the simulated `worlds`.
-        worlds: names of simulated `WORLDS`, `data.pairs` pairs each, where no files are given.
-        also_train: names of simulated `WORLDS` that every fold trains on besides, `data.pairs` pairs each.
+        worlds: names of simulated `WORLDS`, `data.pairs` pairs each, if no files are given.
+        also_train: names of simulated `WORLDS` that every fold trains on too, `data.pairs` pairs each.
         protocols: `leave_one_pair_out` (the paper's; consecutive pairs share a scan, so it leaks) and `leave_one_sequence_out`.
         joint_alone: of all the methods, only the joint model (for ablations).
-        test_every: test every so many pairs only, for models that are slow to decode.
+        test_every: test only every so-many-th pair, for models that are slow to decode.
         leave_out: features, named as in `FeatureConfig.left_out`: a variant without each of them (for ablations).
         joint_variants: in leave_one_sequence_out, the joint model by exact likelihood and as a lattice too (half of a fold's time).
         figures: pairs to draw, as SEQUENCE:NUMBER, the number counting from 0; none: one of each of the first three.
@@ -49,10 +49,10 @@ class ExperimentConfig:
 
 @dataclass(frozen=True)
 class RunConfig(Config):
-    """Everything in a configuration file: one run of `train.py` or of `torchcrf-scan experiment`.
+    """All settings of a configuration file: one run of `train.py` or of `torchcrf-scan experiment`.
 
     Attributes:
-        experiment: what `torchcrf-scan experiment` does; `train.py` does not look at it.
+        experiment: settings of `torchcrf-scan experiment`; ignored by `train.py`.
     """
 
     experiment: ExperimentConfig = field(default_factory=ExperimentConfig)

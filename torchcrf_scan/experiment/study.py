@@ -1,4 +1,4 @@
-"""The pairs of an experiment and what is found in them once for all folds."""
+"""The pairs of an experiment with the results shared by all folds."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from torchcrf_scan.learning.material import Collection, collect
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import Floats, ScanPair
 
-Features = tuple[JointScanCRF, Margins]  # a model whose scales and boosters were fitted, and its out-of-fold boosters
+Features = tuple[JointScanCRF, Margins]  # a model with fitted scales and boosters, and its out-of-fold boosters
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """The pairs of an experiment and what is found in them once for all folds.
+    """The pairs of an experiment with the results shared by all folds.
 
     Attributes:
-        pairs: P annotated pairs. collection: the same, as learning sees them.
-        icp_shares: (P, G) outliers that ICP finds with every one of its `GATES`.
-        kept: folder of scales and boosters that were fitted, for variants of the model that share them; None: none are kept.
+        pairs: P annotated pairs. collection: the same, prepared for learning.
+        icp_shares: (P, G) share of outliers of ICP at each of its `GATES`.
+        kept: folder of fitted scales and boosters, for variants of the model that share them; None: no cache.
     """
 
     pairs: tuple[ScanPair, ...]
@@ -39,7 +39,7 @@ class Study:
 
     @classmethod
     def of(cls, pairs: Sequence[ScanPair], config: RunConfig, jobs: int) -> Study:
-        """Looks at the pairs, on `jobs` cores. Raises ValueError for pairs without annotation."""
+        """Surveys the pairs on `jobs` cores. Raises ValueError for pairs without annotation."""
         collection = collect(pairs, config.learning, jobs)
         if config.experiment.joint_alone:
             return cls(tuple(pairs), collection, np.zeros((len(pairs), len(GATES))))
@@ -47,12 +47,12 @@ class Study:
         return cls(tuple(pairs), collection, np.stack(shares))
 
     def features_of(self, key: str) -> Features | None:
-        """Scales and boosters that were kept under a key."""
+        """Cached scales and boosters of a key."""
         place = self._place(key)
         return pickle.loads(place.read_bytes()) if place is not None and place.is_file() else None
 
     def keep(self, key: str, features: Features) -> None:
-        """Keeps them where others find them, in this process or another; whole or not at all."""
+        """Saves scales and boosters for other variants, in this or another process; written atomically."""
         place = self._place(key)
         if place is not None and not place.is_file():
             temporary = place.with_suffix(f".{os.getpid()}")

@@ -1,1 +1,1 @@
-"""Features."""
+"""Features and potentials of both chains, in tensors."""

@@ -1,4 +1,4 @@
-"""Features of the association chain: which point of the second scan a point became (spec 1.2 and 3).
+"""Features of the association chain: which point of the second scan corresponds to a source point (spec 1.2 and 3).
 
 A state is a candidate (a target point) or, last, the outlier. Errors are stored as minus a robust square, so that a sensible
 weight is positive. In the dense model every target point is a candidate.
@@ -23,14 +23,14 @@ def _of_candidates(values: Tensor, candidates: Tensor) -> Tensor:
 
 
 def shape_features(source: ShapeDescriptors, target: ShapeDescriptors, candidates: Tensor, scales: Scales) -> Tensor:
-    """L1..L9: how alike the surroundings of source point and candidate are; unchanged when either scan moves.
+    """L1..L9: similarity of the neighbourhoods of source point and candidate; invariant to motions of either scan.
 
     Args:
         source, target: descriptors of N and M points.
         candidates: (B, N, K) target points.
 
     Returns:
-        (B, N, K, 9), order of `LOCAL_CHANNELS`. After and before the point count half each (A-02).
+        (B, N, K, 9), order of `LOCAL_CHANNELS`. The sides after and before the point weigh one half each (A-02).
     """
 
     def lengths(of_source: Tensor, of_target: Tensor, scale: Tensor) -> Tensor:
@@ -77,10 +77,10 @@ def outlier_inputs(local: Tensor, data_margin: Tensor, candidates: Tensor, candi
     Args:
         local: (B, N, K, 12) channels of the candidates.
         data_margin: (B, N, K) data booster.
-        candidates, candidate_mask: (B, N, K); a place is other when it is 3 or more points away.
+        candidates, candidate_mask: (B, N, K); another place is 3 or more points away.
 
     Returns:
-        (B, N, 14); without a candidate every error is the worst there is and the margin 0.
+        (B, N, 14); without a candidate every channel is -kappa (the largest error) and the margin 0.
     """
     some = candidate_mask.any(-1)  # (B, N)
     best_local = local.masked_fill(~candidate_mask[..., None], -torch.inf).amax(-2)

@@ -1,7 +1,7 @@
 """AdaBoost over decision stumps, evaluated in torch.
 
-A sum of stumps is additive over features, so the ensemble is one lookup table a feature: the thresholds, and the margin between
-each two of them. Fitting is `learning/boosting_fit.py`. The smooth variant puts a sigmoid in the place of every step.
+A sum of stumps is additive over features, so the ensemble is one lookup table per feature: the thresholds, and the margin of
+every interval between them. Fitting is in `learning/boosting_fit.py`. The smooth variant replaces every step by a sigmoid.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from torch import Tensor, nn
 class StumpEnsemble(nn.Module):
     """H(phi) = sum_t alpha_t h_t(phi) over `stumps` decision stumps (spec 2.2); zero until it is fitted.
 
-    With width 0 it is step-shaped: its gradient with respect to the inputs is zero wherever it is defined. With a width above 0
-    every step is a sigmoid of that width: differentiable in inputs, thresholds and table, and as the width goes to 0 the same
-    margins but at the thresholds themselves, where a sigmoid is half way up.
+    With width 0 it is piecewise constant: its gradient with respect to the inputs is zero wherever it is defined. With a width
+    above 0 every step is a sigmoid of that width: differentiable in inputs, thresholds and table. As the width goes to 0 the
+    margins converge to those of the steps, except at the thresholds themselves, where a sigmoid is one half.
 
     Attributes:
         thresholds: (F, T) ascending, padded with inf; at most T of all are finite.
@@ -43,7 +43,7 @@ class StumpEnsemble(nn.Module):
 
     @torch.no_grad()
     def set_stumps(self, feature: Tensor, threshold: Tensor, left: Tensor, right: Tensor) -> None:
-        """Takes T fitted stumps: h = left where phi[feature] <= threshold, else right (both already times alpha). (T,) each."""
+        """Sets T fitted stumps: h = left where phi[feature] <= threshold, else right (both already times alpha). (T,) each."""
         self.thresholds.fill_(torch.inf)
         self.table.zero_()
         for f in range(len(self.thresholds)):
@@ -58,13 +58,13 @@ class StumpEnsemble(nn.Module):
     def margins(self, phi: Tensor, first: int = 0) -> Tensor:
         """Margin of the features `first` to `first + n`. phi: (..., n). Returns (...); the sum over all features is `forward`.
 
-        Lets what does not change between iterations be kept: only the registered channel depends on the motions (spec 2.5.4).
+        Lets constant parts be cached between iterations: only the registered channel depends on the motions (spec 2.5.4).
         """
         rows = slice(first, first + phi.shape[-1])
         if self.width > 0:
             return smooth_margins(phi, self.thresholds[rows], self.table[rows], self.width)
         flat = phi.detach().reshape(-1, phi.shape[-1]).T.contiguous()  # (n, P)
-        place = torch.searchsorted(self.thresholds[rows].to(flat.dtype), flat)  # thresholds below phi
+        place = torch.searchsorted(self.thresholds[rows].to(flat.dtype), flat)  # number of thresholds below phi
         return self.table[rows].gather(1, place).sum(0).view(phi.shape[:-1])
 
     def forward(self, phi: Tensor) -> Tensor:
@@ -81,7 +81,7 @@ def smooth_margins(phi: Tensor, thresholds: Tensor, table: Tensor, width: float)
         phi: (..., F). thresholds: (F, T), of which at most T are finite. table: (F, T+1).
 
     Returns:
-        (...), at the cost of T sigmoids each, for padding is left out.
+        (...), at the cost of T sigmoids each, as padding is skipped.
     """
     T = thresholds.shape[1]
     order = thresholds.detach().flatten().argsort(stable=True)[:T]  # the finite ones of all features, and some padding

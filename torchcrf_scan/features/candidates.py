@@ -1,4 +1,4 @@
-"""The target points that a source point may have become: K of them, or all (spec 7.7)."""
+"""Candidate target points of every source point: K of them, or all (spec 7.7)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcrf_scan.geometry import se2
 
-LARGEST_BLOCK = 2_000_000  # distances that are held at once
+LARGEST_BLOCK = 2_000_000  # number of distances in memory at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class Candidates:
     Attributes:
         index: (B, N, K) target points.
         mask: (B, N, K) bool, real candidates (fewer than K where the target scan is short).
-        nearest: (B, N, C) nearest target point under every active motion; 0 under the others.
+        nearest: (B, N, C) nearest target point under every active motion; 0 for inactive ones.
     """
 
     index: Tensor
@@ -28,7 +28,7 @@ class Candidates:
 
 
 def squared_distances(moved: Tensor, target_points: Tensor, target_mask: Tensor) -> Tensor:
-    """(B, ..., M) squared distances, inf to padding; by one matrix product, so good to about 1e-7 of the scan's extent squared.
+    """(B, ..., M) squared distances, inf to padding; by one matrix product, so accurate to about 1e-7 of the squared scan extent.
 
     moved: (B, ..., 2); target_points: (B, M, 2); target_mask: (B, M).
     """
@@ -41,14 +41,14 @@ def squared_distances(moved: Tensor, target_points: Tensor, target_mask: Tensor)
 def by_motion(
     source_points: Tensor, target_points: Tensor, target_mask: Tensor, motions: Tensor, active: Tensor, count: int
 ) -> Candidates:
-    """The `count` target points that come nearest under any active motion; all of them when count is 0 (dense).
+    """The `count` nearest target points under any active motion; all of them when count is 0 (dense).
 
     Args:
         source_points: (B, N, 2); target_points: (B, M, 2); target_mask: (B, M); motions: (B, C, 3); active: (B, C).
         count: K; time grows with B C N M.
     """
-    with torch.no_grad():  # a choice of states, not a function to follow
-        if torch.compiler.is_compiling():  # what is compiled serves any number of pairs, so it cannot count them
+    with torch.no_grad():  # a choice of states has no gradient
+        if torch.compiler.is_compiling():  # a compiled program serves any number of pairs, so the block size cannot depend on it
             return _by_motion(source_points, target_points, target_mask, motions, active, count)
         size = max(1, LARGEST_BLOCK // max(1, target_mask.numel()))
         blocks = [_by_motion(part, target_points, target_mask, motions, active, count) for part in source_points.split(size, dim=1)]
@@ -61,7 +61,7 @@ def _by_motion(
     B, C = active.shape
     closest_under = []
     over_motions = source_points.new_full((B, source_points.shape[1], target_points.shape[1]), torch.inf)
-    for c in range(C):  # a motion at a time: the largest tensor stays (B, N, M)
+    for c in range(C):  # one motion at a time, so that the largest tensor is (B, N, M)
         distance = squared_distances(se2.apply(motions[:, c], source_points), target_points, target_mask)
         closest_under.append(torch.where(active[:, c, None], distance.argmin(-1), 0))
         over_motions = torch.where(active[:, c, None, None], torch.minimum(over_motions, distance), over_motions)
@@ -81,7 +81,7 @@ def every_target(source_points: Tensor, target_mask: Tensor) -> tuple[Tensor, Te
 
 
 def with_targets(index: Tensor, mask: Tensor, association: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Adds a given target to every point's candidates, in place of the last, and finds it there.
+    """Adds a given target to every point's candidates, replacing the last if it is missing, and returns its position.
 
     Args:
         index, mask: (B, N, K). association: (B, N), -1 outlier.
@@ -102,7 +102,7 @@ def with_targets(index: Tensor, mask: Tensor, association: Tensor) -> tuple[Tens
 
 
 def by_score(score: Tensor, target_mask: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Index and mask (B, N, K) of the best `count` targets by a (B, N, M) score: the cold search, when no motion is known."""
+    """Index and mask (B, N, K) of the best `count` targets by a (B, N, M) score: used when no motion is known."""
     masked = score.masked_fill(~target_mask[:, None], -torch.inf)
     best, index = masked.topk(min(count, score.shape[-1]), dim=-1)
     mask = best > -torch.inf

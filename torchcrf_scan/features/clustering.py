@@ -1,6 +1,6 @@
 """Features of the clustering chain: background, movers, outliers (spec 4).
 
-The clusters' motions and the current associations are plugged in as if observed (A-09); C = D-1 motions, the outlier is state D.
+The clusters' motions and the current associations are treated as observed (A-09); C = D-1 motions, the outlier is state D.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from torchcrf_scan.geometry import se2
 
 @dataclass(frozen=True, slots=True)
 class Correspondence:
-    """Where every source point goes under every motion and what it meets there.
+    """Every source point under every motion, with its distance to the target.
 
     Attributes:
         moved: (B, N, C, 2) source points under every motion.
         residual: (B, N, C) distance to the associated target point, or to the nearest one for an outlier (A-15).
-        partner: (B, N, 2) associated target point; meaningless for an outlier.
+        partner: (B, N, 2) associated target point; undefined for an outlier.
         is_inlier: (B, N) whether the point has an association.
     """
 
@@ -64,7 +64,7 @@ def local_features(at: Correspondence, active: Tensor, scales: Scales) -> Tensor
 
 
 def elasticity(stretch: Tensor, scales: Scales) -> tuple[Tensor, Tensor]:
-    """Stiffness (a kernel) and minus the robust square of what an edge gained in length (A-16)."""
+    """Stiffness (a kernel) and minus the robust square of an edge's elongation (A-16)."""
     return torch.exp(-((stretch / scales.neighbour_distance) ** 2)), robust_square(stretch, scales.neighbour_distance)
 
 

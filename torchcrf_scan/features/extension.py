@@ -1,8 +1,8 @@
-"""Features beside the paper's thirty (`features.decisions`, `features.free_space`): what parts inliers from outliers.
+"""Features in addition to the paper's thirty (`features.decisions`, `features.free_space`), for the inlier/outlier decision.
 
-Robust squares say little of how far is too far, so there is a gate and a constant; nor do they insist on the nearest of several
-points. And a point that beams of the other scan go through under a motion does not move so (design finding 13). Names and order
-are those of `scales.py`.
+Robust squares do not set a distance limit for inliers, so there are a gate and a constant; nor do they prefer the nearest of
+several points enough. And a point in the free space of the other scan under a motion does not move so (design finding 13).
+Names and order are those of `names.py`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ ORDER = [[*_OF_INLIERS, *_OF_OUTLIER].index(name) for name in (*CLUSTERING_DECIS
 
 
 def association_extension(distance: Tensor, mask: Tensor, sight: FreeSpace, scales: Scales) -> Tensor:
-    """The association chain's extension of every state, the outlier last.
+    """The association chain's extension features of every state, the outlier last.
 
     Args:
         distance: (B, N, K) to the candidates under the point's own motion; mask: (B, N, K) which are real.
-        sight: what the target's beams say of the points under their own motion, (B, N).
+        sight: free space and occlusion in the target scan of the points under their own motion, (B, N).
 
     Returns:
         (B, N, K+1, 5).
@@ -39,12 +39,12 @@ def association_extension(distance: Tensor, mask: Tensor, sight: FreeSpace, scal
 
 
 def clustering_extension(residual: Tensor, ahead: FreeSpace, back: FreeSpace, is_inlier: Tensor, scales: Scales) -> Tensor:
-    """The clustering chain's extension of every state, the outlier last.
+    """The clustering chain's extension features of every state, the outlier last.
 
     Args:
         residual: (B, N, C) under every motion.
-        ahead: what the target's beams say of the points under every motion, (B, N, C).
-        back: what the source's beams say of the points' partners under every motion's inverse, (B, N, C); counts for inliers.
+        ahead: free space and occlusion in the target scan of the points under every motion, (B, N, C).
+        back: the same in the source scan of the points' partners under every motion's inverse, (B, N, C); inliers only.
         is_inlier: (B, N) whether the point has a partner.
 
     Returns:
@@ -59,5 +59,5 @@ def clustering_extension(residual: Tensor, ahead: FreeSpace, back: FreeSpace, is
 
 
 def with_outlier(inliers: Tensor, outlier: Tensor) -> Tensor:
-    """Joins features of inlier states (B, N, S, F) and of the outlier (B, N, G), neither having the other's: (B, N, S+1, F+G)."""
+    """Joins features of inlier states (B, N, S, F) and of the outlier (B, N, G), zero for each other: (B, N, S+1, F+G)."""
     return torch.cat([pad(inliers, (0, outlier.shape[-1])), pad(outlier, (inliers.shape[-1], 0))[:, :, None]], dim=2)

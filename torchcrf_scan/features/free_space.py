@@ -1,7 +1,7 @@
-"""What the beams of a scan say of points carried into it.
+"""Free space and occlusion: consistency of points with the beams of another scan.
 
-A point in front of what a beam hit contradicts that beam, which went through it; one behind it is hidden from it: the consistency
-test that tells movers from static outliers (Wang and Thorpe, the paper's [24]; design finding 13).
+A point in front of a beam's return contradicts that beam, which passed through it; a point behind it is occluded: the consistency
+test that separates movers from static outliers (Wang and Thorpe, the paper's [24]; design finding 13).
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-SLACK_STEPS = 3.0  # beam spacings and noises that a range may differ by,
-SLACK_SHARE = 0.02  # and share of the range: calibration, tilt
-BACKWARDS = 1e-4  # radians; a step back by so little is no turn
-WIDEST_GAP = 2.5  # beam steps between two returns from which on nothing is known between them
+SLACK_STEPS = 3.0  # tolerance on a range, in beam spacings and noises,
+SLACK_SHARE = 0.02  # and as a share of the range: calibration, tilt
+BACKWARDS = 1e-4  # radians; smaller steps back are rounding errors
+WIDEST_GAP = 2.5  # beam steps; between returns farther apart the scan holds no information
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """B scans as their sensor sees them.
+    """B scans in polar coordinates about their sensor.
 
     Attributes:
-        origin: (B, 2) where the sensor stands.
+        origin: (B, 2) position of the sensor.
         ranges: (B, N), bearings: (B, N) rising through the scan, inf in the padding.
         count: (B,) real points. closed: (B,) bool.
         step: (B,) usual bearing step, radians. noise: (B,) of a range, in the unit of the points.
@@ -48,29 +48,29 @@ class Sweep:
         turns = rising_turn(torch.atan2(arms[..., 1], arms[..., 0]).diff(dim=1)).masked_fill(~mask[:, 1:], 0.0)  # (B, N-1)
         first = torch.atan2(arms[:, :1, 1], arms[:, :1, 0])
         bearings = torch.cat([first, first + turns.cumsum(1)], dim=1).masked_fill(~mask, torch.inf)
-        known = pad(turns.masked_fill(~mask[:, 1:], torch.nan), (0, 1), value=torch.nan)  # one point has no turn
+        known = pad(turns.masked_fill(~mask[:, 1:], torch.nan), (0, 1), value=torch.nan)  # a single point has no step
         step = known.nanmedian(1).values.nan_to_num(nan=math.radians(0.5))
         return cls(origin, ranges, bearings, count, closed, step, noise)
 
 
 def rising_turn(difference: Tensor) -> Tensor:
-    """Counter-clockwise angle in [0, 2 pi); a step back by rounding is no turn."""
+    """Counter-clockwise angle in [0, 2 pi); steps back within rounding error count as 0."""
     return ((difference + BACKWARDS) % (2 * math.pi) - BACKWARDS).clamp(min=0)
 
 
 def bearing_in(scan: Sweep, arms: Tensor) -> Tensor:
-    """(B, P) directions of arms (B, P, 2) from the sensor, as numbers on the scale of the scan's rising bearings."""
+    """(B, P) bearings of vectors (B, P, 2) from the sensor, unwrapped as the scan's rising bearings."""
     first, half = scan.bearings[:, :1].nan_to_num(posinf=0.0), scan.step[:, None] / 2
     return first + (torch.atan2(arms[..., 1], arms[..., 0]) - first + half) % (2 * math.pi) - half
 
 
 @dataclass(frozen=True, slots=True)
 class FreeSpace:
-    """How far beams contradict points and hide them, each from 0 (not) to 1 (clearly).
+    """Degrees of contradiction and occlusion of points by beams, each from 0 to 1.
 
     Attributes:
-        seen_through: (B, ...) the beams on both sides went on past the point: it cannot be there.
-        hidden: (B, ...) they stopped before it, or the sensor does not look there.
+        seen_through: (B, ...) the beams on both sides passed the point, which therefore cannot be there.
+        hidden: (B, ...) the beams stopped before it, or it is outside the field of view.
     """
 
     seen_through: Tensor
@@ -78,7 +78,7 @@ class FreeSpace:
 
 
 def look(scan: Sweep, points: Tensor) -> FreeSpace:
-    """What a scan's beams say of points in its frame. points: (B, ..., 2). Differentiable in the points but for the kinks."""
+    """Free space and occlusion of points (B, ..., 2) in a scan's frame. Differentiable in the points except at kinks."""
     shape = points.shape[:-1]
     arms = points.flatten(1, -2) - scan.origin[:, None]  # (B, P, 2)
     ranges = torch.linalg.vector_norm(arms, dim=-1)

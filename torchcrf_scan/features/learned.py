@@ -1,4 +1,4 @@
-"""What a larger network says of the points: embeddings whose similarity scores associations, and log potentials of its own.
+"""Learned inputs from a neural network: embeddings whose similarity scores associations, and extra log potentials.
 
 A similarity enters twice, each time with a named weight of the association chain:
 
@@ -6,7 +6,7 @@ A similarity enters twice, each time with a named weight of the association chai
     data score of a candidate   += embedding_data * similarity, before the data booster's weight a13
 
 so that its whole weight is `embedding + data_boosting * embedding_data`, and through the data score it also reaches the outlier
-booster (best score and its lead). The log potentials of `ExtraLogUnary` are added as they are, in nats.
+booster (best score and its lead). The log potentials of `ExtraLogUnary` are added without a weight, in nats.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from torch import Tensor
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.tree import tensor_tree
 
-EMBEDDING_WEIGHTS = ("embedding", "embedding_data")  # of the association chain, where `FeatureConfig.embedding` is on
-SHORTEST = 1e-3  # length of an embedding below which its direction counts less and less
+EMBEDDING_WEIGHTS = ("embedding", "embedding_data")  # of the association chain, if `FeatureConfig.embedding` is on
+SHORTEST = 1e-3  # added in quadrature to an embedding's length, so that the direction of very short ones hardly counts
 
 
 @tensor_tree
 @dataclass(frozen=True, slots=True)
 class ExtraLogUnary:
-    """Learned log potentials of source points, in nats; None: none. Padding is not looked at.
+    """Learned log potentials of source points, in nats; None: none. Padding is ignored.
 
     Attributes:
         outlier: (B, N) of the outlier state of both chains.
@@ -37,7 +37,7 @@ class ExtraLogUnary:
     moving: Tensor | None = None
 
     def plus(self, other: ExtraLogUnary) -> ExtraLogUnary:
-        """Both together."""
+        """The sum of both."""
         return ExtraLogUnary(_sum(self.outlier, other.outlier), _sum(self.moving, other.moving))
 
 
@@ -72,13 +72,13 @@ class Embeddings:
         return (self.source[:, :, None] * gather_points(self.target, candidates)).sum(-1)
 
     def data_score(self, candidates: Tensor) -> Tensor:
-        """(B, N, K) the similarity's part of the data score."""
+        """(B, N, K) the similarity's contribution to the data score."""
         return self.data_weight * self.similarity(candidates)
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedInputs:
-    """All that `forward` was given beside the scans.
+    """Embeddings and extra log potentials of a batch, checked.
 
     Attributes:
         embeddings: of the points; None: none.
@@ -108,7 +108,7 @@ class LearnedInputs:
 
     @property
     def _reference(self) -> Tensor:
-        """A tensor of the right dtype and device, (B, N) where there are extra log potentials."""
+        """A tensor with the dtype and device of the inputs, (B, N) if there are extra log potentials."""
         given = (self.outlier, self.moving, None if self.embeddings is None else self.embeddings.source)
         return next(value for value in given if value is not None)
 
@@ -118,15 +118,15 @@ def _sum(one: Tensor | None, other: Tensor | None) -> Tensor | None:
 
 
 def add_log(log_unary: Tensor, extra: Tensor | None) -> Tensor:
-    """The sum, or the former alone."""
+    """The sum, or `log_unary` if there are no extra potentials."""
     return log_unary if extra is None else log_unary + extra
 
 
 def association_extra(learned: LearnedInputs | None, candidates: Tensor) -> Tensor | None:
-    """`LearnedInputs.association`, None where nothing was learned."""
+    """`LearnedInputs.association`; None without learned inputs."""
     return None if learned is None else learned.association(candidates)
 
 
 def clustering_extra(learned: LearnedInputs | None, states: int) -> Tensor | None:
-    """`LearnedInputs.clustering`, None where nothing was learned."""
+    """`LearnedInputs.clustering`; None without learned inputs."""
     return None if learned is None else learned.clustering(states)

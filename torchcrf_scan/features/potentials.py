@@ -1,4 +1,4 @@
-"""From features to potentials: everything that both chains need to know of a batch, and the modules that were fitted for it."""
+"""From features to potentials: the prepared batch of both chains, and the modules fitted for it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchcrf_scan.features.shape import ShapeDescriptors, describe, local_spaci
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.names import ASSOCIATION_UNARY, CLUSTERING_UNARY, LOCAL_CHANNELS, STATIC_CHANNELS
 
-LARGEST_BLOCK = 500_000  # pairs of points that are compared in shape at once
+LARGEST_BLOCK = 500_000  # pairs of points compared in shape at once
 OUTLIER_INPUTS = len(LOCAL_CHANNELS) + 2
 REFERENCE_UNIT = 0.1  # metres; the resolution of a street scanner, so that scales keep their usual size in the unit `spacing`
 
@@ -37,13 +37,13 @@ class Boosters(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class PairView:
-    """A batch and the descriptors of its scans: what does not depend on motions or candidates.
+    """A batch and the descriptors of its scans: quantities independent of motions and candidates.
 
     Attributes:
-        batch: the pairs in the unit of length that features are measured in.
+        batch: the pairs in the features' unit of length.
         factor: (B,) that unit's factor on metres.
-        source_sweep, target_sweep: the scans as the sensor saw them.
-        learned: what a larger network says of the points; None: nothing.
+        source_sweep, target_sweep: the scans in polar coordinates about their sensors.
+        learned: embeddings and extra log potentials; None: none.
     """
 
     batch: ScanPairBatch
@@ -58,11 +58,11 @@ class PairView:
     def of(
         cls, batch: ScanPairBatch, wrap_closed: bool = True, length_unit: str = "metre", learned: LearnedInputs | None = None
     ) -> PairView:
-        """Describes both scans.
+        """Computes the descriptors of both scans.
 
         Args:
             wrap_closed: neighbours wrap on a closed scan (A-06); off, they clamp as in the paper.
-            length_unit: `metre`, or `spacing`: every pair is measured in what its own scans resolve.
+            length_unit: `metre`, or `spacing`: lengths relative to the resolution of the pair's scans.
         """
         factor = torch.ones_like(batch.dt) if length_unit == "metre" else REFERENCE_UNIT / resolution(batch)
         batch = batch.scaled(factor)
@@ -82,7 +82,7 @@ class PairView:
 
 @torch.no_grad()
 def resolution(batch: ScanPairBatch) -> Tensor:
-    """(B,) metres: half the usual spacing of a pair's points and twice their noise, the size of an ordinary registration error."""
+    """(B,) metres: half the usual spacing of a pair's points plus twice their noise, the size of an ordinary registration error."""
     spacing = []
     for points, mask in ((batch.source, batch.source_mask), (batch.target, batch.target_mask)):
         open_ended = torch.zeros_like(batch.source_closed)
@@ -93,7 +93,7 @@ def resolution(batch: ScanPairBatch) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class AssociationStates:
-    """The inlier states of some source points and what of their features does not depend on the motions.
+    """The inlier states of some source points and the part of their features that does not depend on the motions.
 
     Attributes:
         candidates, mask: (B, N, K) target points and which of them are real.
@@ -119,12 +119,12 @@ class AssociationStates:
         return cls(candidates, mask, static, margin)
 
     def nodes(self, part: slice) -> AssociationStates:
-        """The states of a run of source points."""
+        """The states of a slice of source points."""
         return AssociationStates(self.candidates[:, part], self.mask[:, part], self.static[:, part], self.static_margin[:, part])
 
 
 def registered_points(source_points: Tensor, motions: Tensor, active: Tensor, log_cluster: Tensor) -> Tensor:
-    """(B, N, 2) source points under the best active inlier cluster each (A-12); log_cluster: (B, N, D), the outlier last."""
+    """(B, N, 2) source points under their best active inlier clusters (A-12); log_cluster: (B, N, D), the outlier last."""
     best = log_cluster[..., :-1].masked_fill(~active[:, None], -torch.inf).argmax(-1)  # (B, N)
     motion = motions.gather(1, best[..., None].expand(-1, -1, 3))  # (B, N, 3)
     return se2.apply(motion, source_points[:, :, None])[:, :, 0]
@@ -142,7 +142,7 @@ def association_unary(view: PairView, states: AssociationStates, moved: Tensor, 
 
 
 def unary_at(states: AssociationStates, registered: Tensor, scales: Scales, boosters: Boosters) -> Tensor:
-    """The paper's 14 of `association_unary` from the registered channel (B, N, K) of the candidates."""
+    """The paper's 14 features of `association_unary` from the registered channel (B, N, K) of the candidates."""
     registered = registered[..., None]
     local = torch.cat([states.static, registered], dim=-1)  # (B, N, K, 12)
     margin = states.static_margin + boosters.data.margins(registered, first=STATIC_CHANNELS)
@@ -183,7 +183,7 @@ def clustering_unary(view: PairView, at: clustering.Correspondence, motions: Ten
 
 
 def contradictions(view: PairView, at: clustering.Correspondence, motions: Tensor, scales: Scales) -> Tensor:
-    """(B, N, D, 8) the clustering chain's extensions, which do not depend on what other clusters there are."""
+    """(B, N, D, 8) the clustering chain's extensions, which do not depend on the set of active clusters."""
     carried_back = se2.apply(se2.inverse(motions), at.partner[:, None]).transpose(1, 2)  # (B, N, C, 2)
     sight = look(view.target_sweep, at.moved), look(view.source_sweep, carried_back)
     return clustering_extension(at.residual, *sight, at.is_inlier, scales)
@@ -192,7 +192,7 @@ def contradictions(view: PairView, at: clustering.Correspondence, motions: Tenso
 def possible_clusters(active: Tensor, reach: Tensor | None, points: int) -> Tensor:
     """(B, N, D) states of the clustering chain that are not ruled out; the outlier never is.
 
-    active: (B, C). reach: (B, N, C) clusters that a point is near enough to, None: all. points: N.
+    active: (B, C). reach: (B, N, C) clusters within reach of a point, None: all. points: N.
     """
     inliers = active[:, None].expand(-1, points, -1)
     if reach is not None:
@@ -217,7 +217,7 @@ def clustering_potentials(
 def find_candidates(view: PairView, motions: Tensor, active: Tensor, config: InferenceConfig) -> Candidates:
     """The association chain's inlier states, `config.candidates` of them or all (0), and the nearest target under every motion.
 
-    motions: (B, C, 3), active: (B, C): those that the candidates are near to (`motion`); else they serve `nearest` alone.
+    motions: (B, C, 3), active: (B, C): candidates are the nearest under these (`motion`); otherwise used for `nearest` only.
     """
     batch = view.batch
     scans = (batch.source, batch.target, batch.target_mask)
@@ -234,7 +234,7 @@ def find_candidates(view: PairView, motions: Tensor, active: Tensor, config: Inf
 
 @torch.no_grad()
 def shape_score(view: PairView, rows: slice = slice(None)) -> Tensor:
-    """(B, n, M) how alike the surroundings of some source and all target points are: mean of L1..L9, a street's scales."""
+    """(B, n, M) similarity in shape of a slice of source points and all target points: mean of L1..L9 with a street's scales."""
     source = view.source_shape
     some = ShapeDescriptors(source.distance[:, rows], source.geodesic[:, rows], source.angle[:, rows], source.radius[:, rows])
     every, _ = candidates.every_target(some.radius, view.batch.target_mask)
@@ -243,7 +243,7 @@ def shape_score(view: PairView, rows: slice = slice(None)) -> Tensor:
 
 
 def most_alike(view: PairView, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Index, mask and score (B, N, K) of the `count` target points most alike in shape, a block of source points at a time."""
+    """Index, mask and score (B, N, K) of the `count` target points most similar in shape, a block of source points at a time."""
     N, target_mask = view.batch.source.shape[1], view.batch.target_mask
     size = max(1, LARGEST_BLOCK // max(1, target_mask.numel()))
     blocks = []

@@ -1,4 +1,4 @@
-"""The constants that features are measured in; fitted on the training pairs (spec 1.3, 3, 4), kept with the weights."""
+"""Scales and constants of the features; fitted on the training pairs (spec 1.3, 3, 4), saved with the weights."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchcrf_scan.names import (
 )
 
 GATE_WIDTH = 0.05
-KAPPA = 9.0  # an error of three standard deviations is as bad as any (spec 0.1)
+KAPPA = 9.0  # cap of robust squares: three standard deviations (spec 0.1)
 
 
 # Scales before any fitting, metres or radians.
@@ -25,11 +25,11 @@ LOCAL = {
     **{"geo1": 0.1, "geo3": 0.3, "geo5": 0.5, "radius": 0.5, "translation": 0.5, "registered_translation": 0.1},
 }
 EDGES = {"pairwise_distance": 0.1, "pairwise_translation": 0.15}
-WORST = -4.0  # what a channel gives the outlier
+WORST = -4.0  # value of a channel at the outlier state before any fitting
 
 
 def live_weights(config: FeatureConfig) -> tuple[Tensor, Tensor]:
-    """(23,) and (20,): 1 for the weights that the model has, 0 for those that stay 0 (raw channels in W-B, what is left out)."""
+    """(23,) and (20,): 1 for the weights of the model, 0 for those fixed at 0 (raw channels in W-B, left-out features)."""
     dead = {*config.left_out}
     dead |= set() if config.raw_channels else {f"association.{name}" for name in LOCAL_CHANNELS}
     dead |= set() if config.free_space else {*FREE_SPACE_WEIGHTS}
@@ -40,32 +40,32 @@ def live_weights(config: FeatureConfig) -> tuple[Tensor, Tensor]:
 
 
 def has_weight(config: FeatureConfig, name: str) -> bool:
-    """Whether a model has the parameter `association.NAME` or `clustering.NAME`: the paper's 30 always, extensions where on."""
+    """Whether a model has the parameter `association.NAME` or `clustering.NAME`: the paper's 30 always, extensions if enabled."""
     return (config.free_space or name not in FREE_SPACE_WEIGHTS) and (config.decisions or name not in DECISION_WEIGHTS)
 
 
 def robust_square(error: Tensor, scale: Tensor) -> Tensor:
-    """Minus min((error / scale)^2, kappa): 0 is perfect, -9 as bad as it gets (spec 0.1, A-03)."""
+    """Minus min((error / scale)^2, kappa): 0 for no error, at least -9 (spec 0.1, A-03)."""
     return -((error / scale) ** 2).clamp(max=KAPPA)
 
 
 def beyond_gate(distance: Tensor, scales: Scales) -> Tensor:
-    """0 well inside the gate of outliers, 1 well beyond it, a half at it; it takes about a fifth of the gate to turn."""
+    """Sigmoid of the distance: 0 well inside the gate of outliers, 1/2 at it, 1 well beyond; 0.1 to 0.9 within a fifth of it."""
     return torch.sigmoid((distance / scales.gate - 1) / GATE_WIDTH)
 
 
 class Scales(nn.Module):
-    """Buffers, all in metres or radians unless said; the defaults are those of a street scanner before any fitting.
+    """Scales of the features, as buffers in metres or radians; defaults are those of a street scanner before any fitting.
 
     Attributes:
         local: (12,) scale of every local association channel.
-        local_outlier: (12,) what every channel gives the outlier state: the worst tenth of the true pairs (spec 5.1).
+        local_outlier: (12,) value of every channel at the outlier state: the worst tenth of the true pairs (spec 5.1).
         pairwise: (2,) scales of pairwise distance and pairwise translation.
         pairwise_outlier: (2,) their value on every transition that touches the outlier (A-14).
         cluster_distance: () scale of a point's residual under its own motion.
         outlier_threshold: () residual above which no motion explains a point.
-        gate: () residual that parts true pairs from outliers with the fewest errors.
-        neighbour_weight: () reach of the neighbour weight.
+        gate: () residual that separates true pairs from outliers with the fewest errors.
+        neighbour_weight: () length scale of the neighbour weight.
         neighbour_distance: () scale of the elongation of an edge (stiffness, neighbour distance).
     """
 

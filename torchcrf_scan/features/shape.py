@@ -1,4 +1,4 @@
-"""What the neighbourhood of every point of one scan looks like (spec 1.1): computed once a scan, in O(N)."""
+"""Shape descriptors of the neighbourhood of every point (spec 1.1): computed once per scan, in O(N)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ShapeDescriptors:
 
 
 def neighbour_index(mask: Tensor, closed: Tensor, offsets: Sequence[int]) -> Tensor:
-    """(B, K, N) index of the neighbour so many points on; clamped to the scan's ends, or wrapped round a closed scan (A-05, A-06).
+    """(B, K, N) index of the neighbour at every offset; clamped to the scan's ends, or wrapped round a closed scan (A-05, A-06).
 
     mask: (B, N); closed: (B,); offsets: K.
     """
@@ -47,7 +47,7 @@ def gather_points(points: Tensor, index: Tensor) -> Tensor:
 
 
 def describe(points: Tensor, mask: Tensor, closed: Tensor) -> ShapeDescriptors:
-    """points: (B, N, 2); mask: (B, N); closed: (B,). The descriptors of padding are finite and mean nothing."""
+    """Descriptors of points (B, N, 2); mask: (B, N); closed: (B,). Those of padding are finite and undefined."""
     most = max(ORDERS)
     arms = gather_points(points, neighbour_index(mask, closed, range(-most, most + 1))) - points[:, None]  # (B, 11, N, 2)
     lengths = torch.linalg.vector_norm(arms, dim=-1)
@@ -74,6 +74,6 @@ def _angle(u: Tensor, v: Tensor) -> Tensor:
 
 
 def local_spacing(shape: ShapeDescriptors) -> Tensor:
-    """(B, N) metres between a point and the next on its own surface: the nearer of the two neighbours, across no depth jump."""
+    """(B, N) metres between a point and the next on its own surface: to the nearer neighbour, so not across a depth jump."""
     nearest = shape.distance[:, :, 0]  # (B, N, 2)
     return torch.where(nearest.amin(-1) > 0, nearest.amin(-1), nearest.amax(-1))

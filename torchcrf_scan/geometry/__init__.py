@@ -1,1 +1,1 @@
-"""Geometry."""
+"""Rigid motions of the plane."""

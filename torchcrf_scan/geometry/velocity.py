@@ -1,4 +1,4 @@
-"""Velocities over ground, from motions that a moving sensor saw."""
+"""Velocities over ground, from motions relative to a moving sensor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def ground_velocity(centroid: Array, motion: Array, background: Array, dt: float
     Args:
         centroid: (..., 2) c, of the mover's source points.
         motion: (..., 3) T, the mover's `T_target_source`.
-        background: (..., 3) B, the background's `T_target_source`; its inverse undoes the sensor's own motion.
+        background: (..., 3) B, the background's `T_target_source`; its inverse removes the sensor's own motion.
         dt: seconds between the scans.
 
     Returns:

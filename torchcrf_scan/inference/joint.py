@@ -1,8 +1,8 @@
 """Algorithm 1 in blocks: exact passes over each chain, motions between them, for a number of rounds (spec 7.2, `sweep`).
 
-    candidates -> clustering chain -> motions -> association chain -> motions -> again, until labels and motions settle
+    candidates -> clustering chain -> motions -> association chain -> motions -> again, until labels and motions converge
 
-A pair that has settled is frozen, so that it does not matter which other pairs are in its batch.
+A pair that has converged is frozen, so its result does not depend on the other pairs of the batch.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ from torchcrf_scan.inference.uncertainty import motion_covariance
 from torchcrf_scan.prediction import Prediction
 
 MERGE_ROTATION = 0.01  # radians
-SELECTION_ROUNDS = 2  # that begin with the question which movers there are
-ROBUST_SHARE = 0.3  # of a point's usual residual: across a surface errors are smaller than from point to point
+SELECTION_ROUNDS = 2  # that begin with the selection of movers
+ROBUST_SHARE = 0.3  # of a point's usual residual: errors across a surface are smaller than point-to-point errors
 
 
 class Update(Protocol):
-    """What a round does with both chains: the coupling of the model."""
+    """One round's update of both chains: the coupling of the model."""
 
     def __call__(
         self, view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, model: ModelConfig
@@ -56,7 +56,7 @@ class Update(Protocol):
 def update_in_turns(
     view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, model: ModelConfig
 ) -> State:
-    """Clustering chain, motions, association chain, motions: each chain takes the other's labels as given.
+    """Clustering chain, motions, association chain, motions: each chain is decoded with the other's labels fixed.
 
     A chain that the model does not have is left out.
     """
@@ -81,7 +81,7 @@ def decode(
 
 
 def settle(view: PairView, start: Start, parameters: Parameters, model: ModelConfig, update: Update = update_in_turns) -> Round:
-    """State of B pairs after the last round, clusters that turned out to be one merged."""
+    """State of B pairs after the last round, with clusters of equal motion merged."""
     last = rounds(view, start, parameters, model, update)[-1]
     return replace(last, state=merge_alike(view, last.state, parameters.scales.cluster_distance))
 
@@ -89,7 +89,7 @@ def settle(view: PairView, start: Start, parameters: Parameters, model: ModelCon
 def rounds(
     view: PairView, start: Start, parameters: Parameters, model: ModelConfig, update: Update = update_in_turns
 ) -> list[Round]:
-    """The start and every round after it. With `stop_early` off there are `iterations` of them, and no step depends on a value."""
+    """The start and every round after it. With `stop_early` off always `iterations` rounds, without data-dependent branches."""
     batch, config = view.batch, model.inference
     is_chosen = config.movers == "threshold" or start.log_odds is None or not model.has_clusters
     start = start if is_chosen else start.considered()
@@ -115,7 +115,7 @@ def rounds(
 
 
 def first_state(view: PairView, start: Start, parameters: Parameters, config: InferenceConfig) -> State:
-    """The start as a state: every point in the cluster whose motion meets a target point nearest."""
+    """The start as a state: every point is in the cluster whose motion brings it closest to a target point."""
     batch = view.batch
     found = find_candidates(view, start.motions, start.active, config)
     at = clustering.correspond(batch.source, batch.target, start.motions, found.nearest, start.association)
@@ -148,27 +148,27 @@ def step(
     model: ModelConfig,
     update: Update = update_in_turns,
 ) -> State:
-    """One round: candidates at the present motions, both chains, clusters that have no points any more."""
+    """One round: candidates at the present motions, update of both chains, removal of empty clusters."""
     found = find_candidates(view, state.motions.value, state.motions.active, model.inference)
     state = update(view, start, hold_motions(state, model.inference), found, parameters, model)
     return replace(state, motions=retire_empty(state.motions, count_points(state)))
 
 
 def hold_motions(state: State, config: InferenceConfig) -> State:
-    """The state as features see it: with `detach_motion`, its motions without gradient."""
+    """The state as the features use it: with `detach_motion`, its motions without gradient."""
     if not config.detach_motion:
         return state
     return replace(state, motions=replace(state.motions, value=state.motions.value.detach()))
 
 
 def count_points(state: State) -> Tensor:
-    """(B, C) points with that label and an association."""
+    """(B, C) number of associated points of every cluster."""
     clusters = torch.arange(state.motions.value.shape[1], device=state.cluster.device)
     return ((state.cluster[:, None] == clusters[:, None]) & (state.association >= 0)[:, None]).sum(-1)
 
 
 def inliers_are_background(state: State) -> State:
-    """The clusters of CRF-Matching, which has none: every associated point is background, the others are outliers."""
+    """Cluster labels for CRF-Matching, which has no clusters: associated points are background, the others outliers."""
     log_inliers = state.log_association[..., :-1]
     none = (log_inliers == -torch.inf).all(-1)  # logsumexp has no gradient there
     log_inlier = log_inliers.masked_fill(none[..., None], 0.0).logsumexp(-1).masked_fill(none, -torch.inf)
@@ -179,7 +179,7 @@ def inliers_are_background(state: State) -> State:
 def update_clusters(
     view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig
 ) -> State:
-    """An exact pass over the clustering chain, motions and associations plugged in."""
+    """An exact pass over the clustering chain at fixed motions and associations."""
     batch, scales = view.batch, parameters.scales
     at = clustering.correspond(batch.source, batch.target, state.motions.value, found.nearest, state.association)
     local = clustering_unary(view, at, state.motions.value, state.motions.active, scales)
@@ -228,7 +228,7 @@ def association_labels(best: Tensor, candidates: Tensor, mask: Tensor) -> Tensor
 def update_motions(
     view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig, *, trimmed: bool = False
 ) -> State:
-    """ComputeRT. trimmed: Kabsch leaves out the worst fifth, for a cluster that holds movers as well (spec 9.2)."""
+    """ComputeRT. trimmed: Kabsch without the worst fifth, for a cluster that contains movers too (spec 9.2)."""
     metric = MOTION_METRICS[config.motion_metric]
     if not metric.is_fitted:
         return state
@@ -245,7 +245,7 @@ def update_motions(
 
 
 def select_state(chosen: Tensor, yes: State, no: State) -> State:
-    """`yes` for the pairs where chosen (B,) holds, else `no`."""
+    """`yes` for the pairs where chosen (B,) is True, else `no`."""
 
     def pick(a: Tensor, b: Tensor) -> Tensor:
         return torch.where(chosen.view(-1, *[1] * (a.dim() - 1)), a, b)
@@ -260,7 +260,7 @@ def select_state(chosen: Tensor, yes: State, no: State) -> State:
 
 
 def keep_settled(after: State, before: State, converged: Tensor) -> State:
-    """Pairs that have converged (B,) keep their state."""
+    """`before` for the pairs that have converged (B,), else `after`."""
     return select_state(converged, before, after)
 
 
@@ -270,7 +270,7 @@ def same_labels(a: State, b: State) -> Tensor:
 
 
 def damp(after: State, before: State, older: State) -> State:
-    """Halves the motions' step where the labels have come back to those of two rounds ago (the guard of spec 7.6)."""
+    """Halves the motions' step if the labels equal those of two rounds ago (the guard against cycles of spec 7.6)."""
     swings = same_labels(after, older) & ~same_labels(after, before)
     turn = se2.wrap(after.motions.value[..., :1] - before.motions.value[..., :1])
     half = before.motions.value + torch.cat([turn, after.motions.value[..., 1:] - before.motions.value[..., 1:]], -1) / 2
@@ -287,12 +287,12 @@ def has_settled(after: State, before: State, config: InferenceConfig) -> Tensor:
 
 
 def merge_alike(view: PairView, state: State, scale: Tensor) -> State:
-    """Clusters that turn out to be one become the one with the lower number, at the end and only then (spec 7.5).
+    """Merges clusters with equal motions into the one with the lower number, after the last round only (spec 7.5).
 
-    They are one when their rotations differ by less than 0.01 rad and, over the points of both, their translations by less than
+    Motions are equal if their rotations differ by less than 0.01 rad and, over the points of both, their translations by less than
     `scale`. A cluster without points is not merged.
     """
-    motions = replace(state.motions, value=state.motions.value.detach())  # a decision, not a function to follow
+    motions = replace(state.motions, value=state.motions.value.detach())  # the decision to merge has no gradient
     C = motions.value.shape[1]
     members = (state.cluster[..., None] == torch.arange(C, device=state.cluster.device)).to(motions.value)
     moved = se2.apply(motions.value, view.batch.source[:, None])  # (B, C, N, 2)
@@ -312,7 +312,7 @@ def merge_alike(view: PairView, state: State, scale: Tensor) -> State:
 
 
 def join(state: State, chosen: Tensor, low: int, high: int) -> State:
-    """Gives cluster `high` to `low` in the pairs where chosen (B,) holds."""
+    """Merges cluster `high` into `low` in the pairs where chosen (B,) is True."""
     cluster = torch.where(chosen[:, None] & (state.cluster == high), low, state.cluster)
     columns = list(state.log_cluster.unbind(-1))
     neither = torch.isneginf(columns[low]) & torch.isneginf(columns[high])  # logaddexp has no gradient there
@@ -334,7 +334,7 @@ def read_out(
     converged: Tensor,
     iterations: Tensor,
 ) -> Prediction:
-    """The state as the user sees it, and how sure it is."""
+    """The `Prediction` of a state, with confidences and covariances."""
     batch, motions = view.batch, state.motions.value
     geometry = (batch.source, batch.target, start.target_tangents)
     support = hard_support(*geometry, state.association, state.cluster, motions.shape[1])

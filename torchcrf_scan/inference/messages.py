@@ -1,4 +1,4 @@
-"""Exact messages on a chain, in the log domain: max-product, sum-product and what lies between (the paper's Eqs. 2 and 3)."""
+"""Exact messages on a chain, in the log domain: max-product, sum-product and temperatures in between (the paper's Eqs. 2 and 3)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-LARGEST_BLOCKS = 4_000  # B S^3 above which the S-fold arithmetic of blocks costs more than the steps that they save
+LARGEST_BLOCKS = 4_000  # B S^3 above which the S-fold arithmetic of blocks costs more than the steps that it saves
 
 
 def reduce_states(log_values: Tensor, dim: int, temperature: float) -> Tensor:
-    """max at temperature 0, temperature * logsumexp(x / temperature) above; -inf where nothing is possible."""
+    """max at temperature 0, temperature * logsumexp(x / temperature) above; -inf if all entries are."""
     if temperature == 0:
         return log_values.amax(dim)
     peak = log_values.detach().amax(dim, keepdim=True)
@@ -24,13 +24,13 @@ def reduce_states(log_values: Tensor, dim: int, temperature: float) -> Tensor:
 
 
 def normalise(log_message: Tensor) -> Tensor:
-    """Subtracts the largest entry of the last axis; a message that is impossible everywhere stays so."""
+    """Subtracts the largest entry of the last axis; a message of -inf alone is unchanged."""
     peak = log_message.amax(-1, keepdim=True)
     return log_message - torch.where(peak > -torch.inf, peak, torch.zeros_like(peak)).detach()
 
 
 def silence_padding(log_unary: Tensor, log_pairwise: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Potentials in which padded nodes, all at the end of a chain, say nothing to the real ones. mask: (B, N)."""
+    """Potentials in which padded nodes, all at the end of a chain, send constant messages to the real ones. mask: (B, N)."""
     edge = mask[:, 1:, None, None]
     return (
         torch.where(mask[..., None], log_unary, torch.zeros_like(log_unary)),
@@ -53,14 +53,14 @@ def chain_messages(log_unary: Tensor, log_pairwise: Tensor, temperature: float =
     outgoing = both_unary[:, :-1, :, None] + both_pairwise  # (2B, N-1, S, S)
     first = torch.zeros_like(both_unary[:, :1])
     B, _, S = log_unary.shape
-    pairs = 1 if torch.compiler.is_compiling() else B  # what is compiled serves any number of pairs, and grows with the steps
+    pairs = 1 if torch.compiler.is_compiling() else B  # any number when compiled; size grows with the steps
     pass_on = pass_in_blocks if pairs * S**3 <= LARGEST_BLOCKS else pass_node_by_node
     forward, backward = torch.cat([first, pass_on(outgoing, temperature)], dim=1).unflatten(0, (2, B)).unbind()
     return forward, backward.flip(1)
 
 
 def pass_node_by_node(outgoing: Tensor, temperature: float) -> Tensor:
-    """(B, E, S) messages that leave E edges, normalised, from (B, E, S, S) potentials of edges with the node before; E steps."""
+    """(B, E, S, S) edge potentials, each with the unary of its first node, to (B, E, S) normalised outgoing messages; E steps."""
     message = torch.zeros_like(outgoing[:, :1, 0])[:, 0] if outgoing.shape[1] else outgoing[:, :0, 0]
     messages = []
     for edge in outgoing.unbind(1):
@@ -70,16 +70,16 @@ def pass_node_by_node(outgoing: Tensor, temperature: float) -> Tensor:
 
 
 def pass_in_blocks(outgoing: Tensor, temperature: float) -> Tensor:
-    """The same in about 2 sqrt(E) steps: sqrt(E) blocks at once, each for every state that may enter it, then from block to block.
+    """The same in about 2 sqrt(E) steps: sqrt(E) blocks in parallel, each for every entry state, then from block to block.
 
-    S times the arithmetic in far fewer and larger operations, which wins for few states.
+    S times the arithmetic in far fewer and larger operations, which is faster for few states.
     """
     B, E, S, _ = outgoing.shape
     length = max(1, math.isqrt(max(E, 1)))
     missing = -E % length
     stay = outgoing.new_zeros(S, S).masked_fill(~torch.eye(S, dtype=torch.bool, device=outgoing.device), -torch.inf)
     edges = torch.cat([outgoing, stay.expand(B, missing, S, S)], dim=1).unflatten(1, (-1, length))  # (B, blocks, length, S, S)
-    across = list(edges[:, :, :1].unbind(2))  # from the entry of every block to its every edge
+    across = list(edges[:, :, :1].unbind(2))  # from the entry of a block to each of its edges
     for edge in edges.unbind(2)[1:]:
         across.append(reduce_states(across[-1][..., None] + edge[:, :, None], -2, temperature))
     entry = torch.zeros_like(outgoing[:, :1, 0])[:, 0] if E else outgoing.new_zeros(B, S)
@@ -97,7 +97,7 @@ def pass_in_blocks(outgoing: Tensor, temperature: float) -> Tensor:
 def log_partition(log_unary: Tensor, log_pairwise: Tensor, temperature: float = 1.0) -> Tensor:
     """(B,) log of the summed (temperature 0: of the largest) score of all labellings. Arguments as in `chain_messages`.
 
-    Above temperature 0 its gradient are the marginals, from a second pass; it is not differentiable twice.
+    Above temperature 0 its gradient is computed as the marginals, by a backward pass; it is not differentiable twice.
     """
     if torch.compiler.is_compiling():
         return _total_by_halves(log_unary, log_pairwise, temperature)
@@ -107,7 +107,7 @@ def log_partition(log_unary: Tensor, log_pairwise: Tensor, temperature: float = 
 
 
 def _running_totals(log_unary: Tensor, log_pairwise: Tensor, temperature: float) -> list[Tensor]:
-    """N tensors (B, S), the summed score of everything up to a node in every state of it; and last the (B,) total."""
+    """N tensors (B, S), the log-summed score of all prefixes that end at a node in a given state; last, the (B,) total."""
     totals = [log_unary[:, 0]]
     for node, edge in zip(log_unary.unbind(1)[1:], log_pairwise.unbind(1), strict=True):
         totals.append(reduce_states(totals[-1][:, :, None] + edge, 1, temperature) + node)
@@ -115,8 +115,8 @@ def _running_totals(log_unary: Tensor, log_pairwise: Tensor, temperature: float)
 
 
 def _total_by_halves(log_unary: Tensor, log_pairwise: Tensor, temperature: float) -> Tensor:
-    """(B,) the same total in log2(N) steps, each joining neighbouring stretches: S times the arithmetic, but a small graph."""
-    scores = log_pairwise + log_unary[:, 1:, None]  # (B, E, S, S) of every stretch, by the state before it and its last state
+    """(B,) the same total in log2(N) steps, each joining neighbouring segments: S times the arithmetic, but a small graph."""
+    scores = log_pairwise + log_unary[:, 1:, None]  # (B, E, S, S) of every segment, by the state before it and its last state
     while (E := scores.shape[1]) > 1:
         left, right = scores[:, : E - E % 2 : 2], scores[:, 1::2]
         joined = reduce_states(left[..., None] + right[:, :, None], -2, temperature)
@@ -127,7 +127,7 @@ def _total_by_halves(log_unary: Tensor, log_pairwise: Tensor, temperature: float
 
 
 class _LogPartition(torch.autograd.Function):
-    """The total, and as its gradient the marginals of nodes and edges: several times as fast as going back through N steps."""
+    """The log partition function, its gradient computed as marginals of nodes and edges: several times faster than autograd."""
 
     generate_vmap_rule = True
 
@@ -154,14 +154,14 @@ class _LogPartition(torch.autograd.Function):
 
 
 def _share(log_scores: Tensor, total: Tensor, slope: Tensor, temperature: float) -> Tensor:
-    """slope * exp((scores - total) / temperature), 0 where nothing is possible. total, slope: (B,)."""
+    """slope * exp((scores - total) / temperature), 0 for impossible entries. total, slope: (B,)."""
     shape = (-1, *[1] * (log_scores.dim() - 1))
     possible = torch.where(total > -torch.inf, total, torch.zeros_like(total)).view(shape)
     return slope.view(shape) * torch.exp((log_scores - possible) / temperature)
 
 
 def chain_beliefs(log_unary: Tensor, log_pairwise: Tensor, mask: Tensor, temperature: float = 0.0) -> Tensor:
-    """Normalised log-beliefs (B, N, S): max-marginals at temperature 0, marginals at 1; padding is silent (Eq. 3).
+    """Normalised log-beliefs (B, N, S): max-marginals at temperature 0, marginals at 1; padding is ignored (Eq. 3).
 
     `log_softmax` of unary plus messages; at temperature 1 these are log marginal probabilities.
     """
@@ -171,7 +171,7 @@ def chain_beliefs(log_unary: Tensor, log_pairwise: Tensor, mask: Tensor, tempera
 
 
 def normalise_beliefs(beliefs: Tensor, temperature: float) -> Tensor:
-    """`log_softmax` over the last axis, of beliefs in units of the temperature; impossible everywhere stays so."""
+    """`log_softmax` over the last axis, of beliefs in units of the temperature; rows of -inf alone are unchanged."""
     possible = beliefs.amax(-1, keepdim=True) > -torch.inf
     beliefs = torch.log_softmax(torch.where(possible, beliefs if temperature == 0 else beliefs / temperature, 0.0), dim=-1)
     return torch.where(possible, beliefs, -torch.inf)

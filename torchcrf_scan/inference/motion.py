@@ -11,14 +11,14 @@ from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch, safe_atan2
 
-ALONG = 0.03  # share of a residual along the surface that a point-to-line step still feels
+ALONG = 0.03  # weight of the residual along the surface in a point-to-line step
 KEPT_SHARE, TRIM_ROUNDS = 0.8, 3  # of trimmed Kabsch
 PATIENCE = 2  # rounds for which an empty cluster keeps its motion before it is removed
 
 
 @dataclass(frozen=True, slots=True)
 class Motions:
-    """The continuous half of the state.
+    """The continuous part of the state.
 
     Attributes:
         value: (B, C, 3) motions of background and movers.
@@ -38,13 +38,13 @@ class Motions:
 
 @dataclass(frozen=True, slots=True)
 class Support:
-    """Which point speaks for which cluster, and where it went.
+    """Weighted correspondences from which the motion of every cluster is fitted.
 
     Attributes:
         weights: (B, C, N) non-negative.
-        partner: (B, N, 2) where the point went.
+        partner: (B, N, 2) associated target point.
         tangent: (B, N, 2) direction of the surface there.
-        count: (B, C) points labelled so (always by hard labels).
+        count: (B, C) number of points of the cluster (always by hard labels).
         spread: (B, C) largest extent of those points, metres (root mean square along their main axis).
     """
 
@@ -56,7 +56,7 @@ class Support:
 
 
 def largest_spread(points: Tensor, weights: Tensor) -> Tensor:
-    """sqrt of the largest eigenvalue of the weighted scatter. points: (B, N, 2); weights: (B, C, N). Returns (B, C)."""
+    """sqrt of the largest eigenvalue of the weighted scatter matrix. points: (B, N, 2); weights: (B, C, N). Returns (B, C)."""
     total = weights.sum(-1).clamp(min=1)[..., None]
     mean = weights @ points / total  # (B, C, 2)
     second = weights @ torch.stack([points[..., 0] ** 2, points[..., 1] ** 2, points[..., 0] * points[..., 1]], -1) / total
@@ -67,7 +67,7 @@ def largest_spread(points: Tensor, weights: Tensor) -> Tensor:
 
 
 def hard_support(source: Tensor, target: Tensor, tangents: Tensor, association: Tensor, cluster: Tensor, clusters: int) -> Support:
-    """Unit weights on the points with that label and an association: the paper's Eq. 6.
+    """Unit weights on the associated points of each cluster: the paper's Eq. 6.
 
     Args:
         source: (B, N, 2); target, tangents: (B, M, 2); association, cluster: (B, N), -1 outlier; clusters: C.
@@ -92,7 +92,7 @@ def soft_support(
     """Beliefs as weights and mean partners (A-18), so that gradients reach the feature weights.
 
     Args:
-        hard: the support of the labels, whose counts decide what is degenerate.
+        hard: the support of the labels; degenerate clusters are decided by its counts.
         candidates: (B, N, K); log_association: (B, N, K+1); log_cluster: (B, N, D).
     """
     inlier = log_association[..., :-1].exp()  # (B, N, K)
@@ -106,14 +106,14 @@ def soft_support(
 
 
 def estimate(source: Tensor, support: Support, previous: Motions, *, metric: str, scale: Tensor, min_extent: float) -> Motions:
-    """New motions from the supports, after the rules for small clusters (spec 7.5).
+    """New motions from the supports, with the rules for small clusters (spec 7.5).
 
     Three or more points with some extent: a full fit. Fewer: the background's rotation, the points' translation. None: the
-    motion stays, for two rounds (`retire_empty`). The background with fewer than three points keeps its motion.
+    motion is kept, for two rounds (`retire_empty`). The background with fewer than three points keeps its motion.
 
     Args:
         source: (B, N, 2). metric: one of `FITS`.
-        scale: () residual at which a robust weight has fallen to a half, metres. min_extent: metres.
+        scale: () residual at which a robust weight is one half, metres. min_extent: metres.
     """
     points = source[:, None].expand(-1, support.weights.shape[1], -1, -1)  # (B, C, N, 2)
     partner = support.partner[:, None].expand_as(points)
@@ -148,7 +148,7 @@ def trim(source: Tensor, support: Support) -> Support:
 
 
 def retire_empty(motions: Motions, count: Tensor) -> Motions:
-    """Ends a round: clusters without a point for two rounds are removed, the background never. count: (B, C) points."""
+    """Ends a round: removes clusters (never the background) that had no point for two rounds. count: (B, C) points."""
     empty_for = torch.where(count > 0, 0, motions.empty_for + 1)
     active = motions.active & (empty_for < PATIENCE)
     active = torch.cat([torch.ones_like(active[:, :1]), active[:, 1:]], dim=1)
@@ -156,7 +156,7 @@ def retire_empty(motions: Motions, count: Tensor) -> Motions:
 
 
 def point_fit(points: Tensor, partner: Tensor, support: Support, start: Tensor, scale: Tensor) -> Tensor:
-    """Closed-form Kabsch (Eq. 6), from any start. Arguments as in `line_fit`."""
+    """Closed-form Kabsch (Eq. 6), independent of the start. Arguments as in `line_fit`."""
     return kabsch(points, partner, support.weights)
 
 
@@ -174,7 +174,7 @@ FITS = {"point": point_fit, "line": line_fit}  # by the name of the metric, `cho
 
 @dataclass(slots=True)
 class RunningSums:
-    """Sums from which Eq. 6 follows in O(1) when one label changes (spec 7.4); float64, one column a cluster.
+    """Sums from which Eq. 6 follows in O(1) when one label changes (spec 7.4); float64, per cluster.
 
     Attributes:
         value: (B, C, 10): weight, p (2), q (2), p.q, p x q, p_x^2, p_y^2, p_x p_y.
@@ -184,7 +184,7 @@ class RunningSums:
 
     @staticmethod
     def terms(p: Tensor, q: Tensor) -> Tensor:
-        """What a pair of points (..., 2) adds: (..., 10)."""
+        """(..., 10) contribution of a pair of points (..., 2)."""
         p, q = p.double(), q.double()
         one = torch.ones_like(p[..., :1])
         dot = (p * q).sum(-1, keepdim=True)
@@ -197,11 +197,11 @@ class RunningSums:
         return cls(weights.double() @ cls.terms(p, q))
 
     def change(self, p: Tensor, old_q: Tensor, old: Tensor, new_q: Tensor, new: Tensor) -> None:
-        """One point a pair changes its label or partner. p, old_q, new_q: (B, 2); old, new: (B, C) weights (one-hot or zero)."""
+        """Updates the sums when one point per pair changes label or partner. p, old_q, new_q: (B, 2); old, new: (B, C) weights."""
         self.value = self.value - old[..., None] * self.terms(p, old_q)[:, None] + new[..., None] * self.terms(p, new_q)[:, None]
 
     def motions(self, previous: Motions, min_extent: float) -> Tensor:
-        """(B, C, 3) motions after the rules of spec 7.5, without removing clusters."""
+        """(B, C, 3) motions with the rules of spec 7.5, without removing clusters."""
         count = self.value[..., 0].round()
         total = count.clamp(min=1)[..., None]
         p, q = self.value[..., 1:3] / total, self.value[..., 3:5] / total
@@ -222,11 +222,11 @@ class RunningSums:
         return torch.where(usable[..., None], fitted, before).to(previous.value.dtype)
 
 
-TURN_DAMPING, SHIFT_DAMPING = 1e-4, 1e-3  # of a step, in shares of the lever's weight and of the weight
+TURN_DAMPING, SHIFT_DAMPING = 1e-4, 1e-3  # relative to the weighted lever and to the weight
 
-LEAST_DAMPING = 1e-6  # of a turn about one spot, which has no lever
+LEAST_DAMPING = 1e-6  # of a rotation about a single point, which has no lever
 
-LARGEST_TURN = 0.5  # radians in one step
+LARGEST_TURN = 0.5  # radians per step
 
 
 def gauss_newton_step(moved: Tensor, partner: Tensor, tangent: Tensor, weights: Tensor, along: float) -> Tensor:
@@ -243,7 +243,7 @@ def gauss_newton_step(moved: Tensor, partner: Tensor, tangent: Tensor, weights: 
     residual = moved - partner
     centre = (weights[..., None] * moved).sum(-2, keepdim=True) / weights.sum(-1)[..., None, None].clamp(min=1e-9)
     arm = moved - centre
-    lever = torch.stack([-arm[..., 1], arm[..., 0]], dim=-1)  # d moved / d theta, turning about the weighted centre
+    lever = torch.stack([-arm[..., 1], arm[..., 0]], dim=-1)  # d moved / d theta, rotation about the weighted centre
     slack = 1 - along
 
     def dot_metric(a: Tensor, b: Tensor) -> Tensor:
@@ -256,7 +256,7 @@ def gauss_newton_step(moved: Tensor, partner: Tensor, tangent: Tensor, weights: 
     right = torch.stack([-(weights * dot_metric(a, residual)).sum(-1) for a in basis], -1)
     scale = (weights * (lever**2).sum(-1)).sum(-1)
     damping = torch.stack([TURN_DAMPING * scale + LEAST_DAMPING * total, SHIFT_DAMPING * total, SHIFT_DAMPING * total], dim=-1)
-    step, _ = torch.linalg.solve_ex(normal + torch.diag_embed(damping), right)  # damped, so there is no failure to look for
+    step, _ = torch.linalg.solve_ex(normal + torch.diag_embed(damping), right)  # damped, so always solvable
     theta, shift = step[..., 0].clamp(-LARGEST_TURN, LARGEST_TURN), step[..., 1:]
     pivot = centre[..., 0, :]
     return torch.cat([theta[..., None], pivot - se2.rotate(theta, pivot) + shift], dim=-1)

@@ -1,8 +1,8 @@
 """Pseudo-likelihood of an annotation: every label given its neighbours' true labels (spec 6.2).
 
-It needs the features alone, as one tensor a chain: `association_design` and `clustering_design`, rows = nodes, columns = states.
-A conditional logit over them is the objective, convex in the weights; learning builds the designs once and optimises on them.
-`Chain` keeps the transitions too, for the exact likelihood (spec 6.5).
+It needs the features only, as one tensor per chain: `association_design` and `clustering_design`, rows = nodes, columns =
+states. The objective is that of a conditional logit model, convex in the weights; learning builds the designs once and
+optimises on them. `Chain` keeps the transitions too, for the exact likelihood (spec 6.5).
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from torchcrf_scan.inference.state import Parameters
 
 @dataclass(frozen=True, slots=True)
 class PlugIns:
-    """What the features take as observed while the weights are learned (spec 2.5, 4.1).
+    """Motions and labels that the features treat as observed while the weights are learned (spec 2.5, 4.1).
 
     Attributes:
         motions: (B, C, 3), active: (B, C).
         association: (B, N) hat x_a in the clustering features, -1 outlier.
         cluster: (B, N) hat x_c in the registered channel, -1 outlier (moved with the background).
         label: (B, N) true cluster as a slot of `motions`, -1 outlier.
-        known: (B, N) bool, nodes whose labels count.
-        reach: (B, N, C) clusters that a point is near enough to; None: all.
+        known: (B, N) bool, annotated nodes.
+        reach: (B, N, C) clusters within reach of a point; None: all.
     """
 
     motions: Tensor
@@ -62,8 +62,8 @@ class Design:
     """A chain's features at the true labels of the neighbours.
 
     Attributes:
-        features: (B, N, S, W). mask: (B, N, S) possible states. label: (B, N) true state. known: (B, N) nodes that count.
-        extra: (B, N, S) log potentials that are not of the weights, as a larger network gives them; None: none.
+        features: (B, N, S, W). mask: (B, N, S) possible states. label: (B, N) true state. known: (B, N) annotated nodes.
+        extra: (B, N, S) log potentials without a weight, from learned inputs; None: none.
     """
 
     features: Tensor
@@ -73,7 +73,7 @@ class Design:
     extra: Tensor | None = None
 
     def log_likelihood(self, weights: Tensor) -> Tensor:
-        """(B, N) log p(true state | neighbours, observation); 0 where nobody knows. weights: (W,)."""
+        """(B, N) log p(true state | neighbours, observation); 0 for unannotated nodes. weights: (W,)."""
         score = add_log(self.features @ weights, self.extra).masked_fill(~self.mask, -torch.inf)
         chosen = torch.log_softmax(score, dim=-1).gather(-1, self.label[..., None])[..., 0]
         return torch.where(self.known, chosen, torch.zeros_like(chosen))
@@ -85,9 +85,9 @@ class Chain:
 
     Attributes:
         unary: (B, N, S, U), pairwise: (B, N-1, S, S, P) features; their weights are U + P.
-        mask: (B, N, S) possible states. label: (B, N) true state. known: (B, N) nodes that count; the others cut the chain.
+        mask: (B, N, S) possible states. label: (B, N) true state. known: (B, N) annotated nodes; the others cut the chain.
         extra: as in `Design`.
-        axes, labels: the tensors' axes after B (n nodes, e edges, s states), and which states a label counts; for stacking.
+        axes, labels: the tensors' axes after B (n nodes, e edges, s states), and the states that a label indexes; for stacking.
     """
 
     axes: ClassVar[dict[str, str]] = {"unary": "ns", "pairwise": "ess", "mask": "ns", "label": "n", "known": "n"}
@@ -101,7 +101,7 @@ class Chain:
     extra: Tensor | None = None
 
     def design(self) -> Design:
-        """The features that pseudo-likelihood needs."""
+        """The features of the pseudo-likelihood."""
         features = torch.cat([self.unary, at_true_neighbours(self.pairwise, self.label, self.known)], dim=-1)
         return Design(features, self.mask, self.label, self.known, self.extra)
 
@@ -119,7 +119,7 @@ class Chain:
 
 
 def true_plugins(batch: ScanPairBatch, clusters: int) -> PlugIns:
-    """Everything at the truth (the faithful reading, A-11); movers beyond the `clusters` slots are unknown."""
+    """Plug-ins from the annotation (the faithful reading, A-11); movers beyond the `clusters` slots are unknown."""
     truth = _truth_of(batch)
     B, G = truth.motions.shape[:2]
     slots = min(G, clusters)
@@ -141,7 +141,7 @@ def _truth_of(batch: ScanPairBatch) -> Truth:
 
 
 def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> Chain:
-    """The association chain's 19 + 4 features; states are the candidates of the decoding and the truth."""
+    """The association chain's 19 + 4 features; states are the candidates of inference and the true target point."""
     batch = view.batch
     truth = _truth_of(batch)
     found = find_candidates(view, plugins.motions, plugins.active, config)
@@ -181,7 +181,7 @@ def clustering_design(view: PairView, plugins: PlugIns, scales: Scales) -> Desig
 
 
 def at_true_neighbours(pairwise: Tensor, label: Tensor, known: Tensor) -> Tensor:
-    """Sum of a node's two edges' features with the neighbours at their true states; nothing where a neighbour is unknown.
+    """Sum of the features of a node's two edges with the neighbours in their true states; 0 for unknown neighbours.
 
     Args:
         pairwise: (B, N-1, S, S, P). label: (B, N) states. known: (B, N).
@@ -205,7 +205,7 @@ def beside_true_neighbours(pairwise: Tensor, label: Tensor, known: Tensor) -> tu
 
 
 def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Parameters, config: ModelConfig) -> Tensor:
-    """(B,) sum over nodes and chains (one chain alone where the model has one)."""
+    """(B,) log pseudo-likelihood summed over nodes and over the chains of the model."""
     total = view.batch.source.new_zeros(len(view.batch))
     if config.has_association:
         design = association_design(view, plugins, parameters.scales, parameters.boosters, config.inference)
@@ -216,7 +216,7 @@ def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Paramete
 
 
 def for_background_alone(plugins: PlugIns) -> PlugIns:
-    """Every point moves with the background: the plug-ins of CRF-Matching."""
+    """The plug-ins of CRF-Matching: every point moves with the background."""
     return replace(
         plugins,
         motions=plugins.motions[:, :1],

@@ -1,11 +1,11 @@
-"""Which hypothesised movers there are: decided by the clustering chain and the hypotheses' scores together (design finding 14).
+"""Selection of hypothesised movers by the clustering chain and the hypotheses' scores together (design finding 14).
 
-Every hypothesis begins as a cluster, the paper's "start with many clusters, discard the vacuous". A cluster stays if what it
-explains that no other cluster does, and what its score says of it, weigh enough:
+Every hypothesis begins as a cluster, the paper's "start with many clusters, discard the vacuous". A cluster stays if the
+evidence of the chain for it and its score outweigh a bias:
 
     bias + explains * log(1 + log Z of the chain with it - log Z without it) + score * log-odds of the hypothesis > 0
 
-The least worth of a pair goes first, for two that explain the same points are each worthless while the other is there.
+Only the cluster of least worth is removed at a time, because of two that explain the same points neither adds to the other.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torchcrf_scan.inference.state import Parameters, State
 
 @torch.no_grad()
 def discard_vacuous(view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig) -> State:
-    """The state without the clusters that are worth less than nothing. Movers only; needs `start.log_odds`."""
+    """The state without the clusters of negative worth. Movers only; needs `start.log_odds`."""
     assert start.log_odds is not None
     chain = ConsideredChain.of(view, start, state, parameters, config)
     active = state.motions.active
@@ -51,11 +51,11 @@ def evidence(view: PairView, start: Start, state: State, parameters: Parameters,
 
 @dataclass(frozen=True, slots=True)
 class ConsideredChain:
-    """The clustering chain at one state's motions and associations, whichever of its clusters are there.
+    """The clustering chain at one state's motions and associations, for any subset of its clusters.
 
     Attributes:
         view, start, parameters: as in `joint.decode`.
-        at: where points go and what they meet. beside_local: (B, N, D, 8) features that ask for no other cluster.
+        at: moved points and their residuals. beside_local: (B, N, D, 8) features that do not depend on the set of clusters.
         pairwise: (B, N-1, D, D, 8).
     """
 
@@ -76,11 +76,11 @@ class ConsideredChain:
         return cls(view, start, parameters, at, contradictions(view, at, motions.value, scales), pairwise)
 
     def evidence(self, active: Tensor) -> Tensor:
-        """(B, C) log Z of the chain of the clusters that are there minus that without the cluster; 0: absent.
+        """(B, C) log Z of the chain with all active clusters minus log Z without the cluster; 0 for inactive ones.
 
-        Without it, its points still count as explained (C2), else its absence would speak for them being outliers.
+        The removed cluster's points still count as explained (C2); otherwise its removal would favour the outlier state there.
 
-        active: (B, C), some or all of the state's.
+        active: (B, C), a subset of the state's.
         """
         mask = self.view.batch.source_mask
         B, C = active.shape

@@ -1,4 +1,4 @@
-"""."""
+"""The start of the rounds: initial motions of a batch, with associations and directions of the target's surfaces."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from torchcrf_scan.tree import tensor_tree
 
 ASSOCIATION_GATE = 3.0  # units of footprint and noise beyond which a point has no associate
 
-REACH_EXTENT = 0.5  # of an object's seen extent, and
+REACH_EXTENT = 0.5  # of an object's visible extent, and
 
-REACH_UNITS = 4.0  # units of resolution beyond it may still be the object
+REACH_UNITS = 4.0  # units of resolution beyond it may still belong to the object
 
-FOOTPRINT = 0.0175  # radians; spacing of a one-degree scanner on a surface that faces it
+FOOTPRINT = 0.0175  # radians; point spacing of a one-degree scanner on a surface that faces it
 
 
 @tensor_tree
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Motions to begin with.
+    """Initial motions.
 
     Attributes:
         motions: (B, C, 3), active: (B, C).
-        association: (B, N) nearest target point under the best motion, -1 where none comes near.
-        target_tangents: (B, M, 2) direction of the target's surface at every point, 0 where it has none.
-        reach: (B, N, C) bool, points near enough to the segment that a mover was found by: an object is in one place. None: any.
-        log_odds: (B, C) what the score says of every mover, those that it alone would not accept (and that are not `active`)
-            included; -inf where there is none, inf for the background. None: `active` has been decided.
+        association: (B, N) nearest target point under the best motion, -1 if none is within the gate.
+        target_tangents: (B, M, 2) direction of the target's surface at every point, 0 where undefined.
+        reach: (B, N, C) bool, points near enough to the segment from which a mover was hypothesised to belong to it. None: all.
+        log_odds: (B, C) score of every mover, including those that the score alone would reject (and that are not `active`);
+            -inf for empty slots, inf for the background. None: `active` is final.
     """
 
     motions: Tensor
@@ -46,16 +46,16 @@ class Start:
 
     @classmethod
     def at(cls, batch: ScanPairBatch, motions: Tensor, active: Tensor) -> Start:
-        """The start where somebody else knows the motions; associations and the surfaces' directions follow from them.
+        """The start at given motions; associations and directions of the surfaces follow from them.
 
-        motions: (B, C, 3), active: (B, C). No step depends on a tensor's value.
+        motions: (B, C, 3), active: (B, C). Control flow does not depend on tensor values.
         """
         tangents, is_found = surface_tangents(batch.target, batch.target_mask, batch.range_noise)
         association = nearest_association(batch, motions, active)
         return cls(motions, active, association, torch.where(is_found[..., None], tangents, torch.zeros_like(tangents)))
 
     def considered(self) -> Start:
-        """The same with all movers that the score does not rule out, for the model to decide about."""
+        """The same with all movers that the score does not rule out, for the model to select from."""
         return self if self.log_odds is None else replace(self, active=self.log_odds > -torch.inf)
 
     def background_alone(self) -> Start:
@@ -63,12 +63,12 @@ class Start:
         return replace(self, motions=self.motions[:, :1], active=self.active[:, :1], reach=None, log_odds=None)
 
     def scaled(self, factor: Tensor) -> Start:
-        """The same start in another unit of length, a factor (B,) a pair."""
+        """The same start in another unit of length; factor: (B,) scale of each pair."""
         return replace(self, motions=scale_motions(self.motions, factor))
 
 
 def within_reach(points: Tensor, members: Tensor, unit: Tensor) -> Tensor:
-    """Points that may belong to the object some of whose points are known: within half its extent and a few units of them.
+    """Points that may belong to an object, given some of its points: within half its extent plus a few units of them.
 
     Args:
         points: (B, N, 2). members: (B, C, N) known points of every cluster. unit: (B,) metres.
@@ -91,7 +91,7 @@ def within_reach(points: Tensor, members: Tensor, unit: Tensor) -> Tensor:
 def nearest_association(
     batch: ScanPairBatch, motions: Tensor, active: Tensor, reach: Tensor | None = None, gate: float = ASSOCIATION_GATE
 ) -> Tensor:
-    """(B, N) target point that comes nearest under any possible motion, -1 beyond `gate` units of footprint and noise."""
+    """(B, N) nearest target point under any possible motion, -1 beyond `gate` units of footprint and noise."""
     possible = possible_clusters(active, reach, batch.source.shape[1])  # (B, N, D)
     nearest = batch.source.new_full(batch.source.shape[:2], torch.inf)
     index = torch.zeros_like(nearest, dtype=torch.int64)

@@ -1,4 +1,4 @@
-"""What the rounds take and pass on: everything that was learned, and the labels, beliefs and motions after each round."""
+"""Inputs and state of the rounds: learned parameters, and the labels, beliefs and motions after each round."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.motion import Motions
 from torchcrf_scan.inference.uncertainty import Calibration
 
-CAPPED = 5.0  # log-odds; a hypothesis is never surer than this
+CAPPED = 5.0  # cap on the log-odds of a hypothesis
 
 
 class ClusterPotential(nn.Module):
-    """The log-linear worth of a mover's cluster; its three named weights are fitted with the rest (`learning.selection_fit`).
+    """Log-linear potential of a mover's cluster; its three weights are fitted with the others (`learning.selection_fit`).
 
     Attributes:
-        explains: () of log(1 + what the cluster adds to the clustering chain's log Z).
-        score: () of the hypothesis' log-odds. bias: ().
+        explains: () weight of log(1 + increase of the clustering chain's log Z by the cluster).
+        score: () weight of the hypothesis' log-odds. bias: ().
     """
 
     explains: Tensor
@@ -34,19 +34,19 @@ class ClusterPotential(nn.Module):
         self.register_buffer("bias", torch.tensor(-2.0))
 
     def forward(self, evidence: Tensor, log_odds: Tensor) -> Tensor:
-        """(...) worth; a cluster below 0 is dropped. evidence, log_odds: (...)."""
+        """(...) worth; clusters below 0 are discarded. evidence, log_odds: (...)."""
         explained, scored = self.terms(evidence, log_odds).unbind(-1)
         return self.bias + self.explains * explained + self.score * scored
 
     @staticmethod
     def terms(evidence: Tensor, log_odds: Tensor) -> Tensor:
-        """(..., 2) what the weights belong to."""
+        """(..., 2) features of the weights `explains` and `score`."""
         return torch.stack([evidence.clamp(min=0).log1p(), log_odds.clamp(-CAPPED, CAPPED)], dim=-1)
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What was learned: weights (23,) and (20,), the features' scales and boosters, honest confidences, a mover's worth."""
+    """Learned parameters: weights (23,) and (20,), scales, boosters, calibration, potential of a mover's cluster."""
 
     association: Tensor
     clustering: Tensor
@@ -58,7 +58,7 @@ class Parameters:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """One round's state of B pairs. Gradients reach the log-beliefs and, where soft, the motions; labels have none.
+    """State of B pairs after a round. Gradients reach the log-beliefs and, where soft, the motions; labels have none.
 
     Attributes:
         motions: motions and which clusters exist.
@@ -78,11 +78,11 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """What B pairs had come to after a round.
+    """State and convergence of B pairs after a round.
 
     Attributes:
         state: labels, beliefs and motions.
-        converged: (B,) bool, settled. iterations: (B,) rounds done.
+        converged: (B,) bool. iterations: (B,) number of rounds.
     """
 
     state: State

@@ -1,9 +1,9 @@
-"""How sure the answer is: covariances of the motions, directions that nothing was seen of, and calibrated confidences.
+"""Uncertainty of predictions: covariances of the motions, unobserved directions, and calibrated confidences.
 
 A motion's errors come from more than the sensor's noise: returns sample a surface, surfaces bend, neighbouring beams share a jolt,
-and the fit stops short. So what the residuals say stands beside what the sensor says, and the covariance is that of a sum of
-correlated scores (a sandwich estimator). What the *noise* of the surface's direction pretends to know must not count: along a
-corridor every noisy tangent seems to hold the motion back. Surfaces are therefore described anew, from stretches long beside noise.
+and the fit stops early. So the covariance uses the larger of residuals and sensor noise, and is that of a sum of correlated
+scores (a sandwich estimator). Noise in the directions of surfaces must not count as information: along a corridor every noisy
+tangent seems to constrain the motion. Tangents are therefore estimated anew, from stretches long compared with the noise.
 """
 
 from __future__ import annotations
@@ -20,34 +20,35 @@ from torchcrf_scan.geometry.kabsch import safe_atan2
 from torchcrf_scan.inference.motion import Support
 from torchcrf_scan.prediction import LEAST_SHARE, Uncertainty
 
-STRETCH, STEPS = 10.0, 2.0  # a surface's direction comes from the points within so many noises and steps to the next point
+STRETCH, STEPS = 10.0, 2.0  # a surface's direction comes from the points within this many noises and steps to the next point
 NEIGHBOURS = 8  # on either side, at most
-RUN = 48  # neighbouring points whose errors may go together: a jolt lasts several degrees
-NOTHING = 1e-3  # of what a point says, so that no matrix is singular
-TINY = 1e-6  # of the scene's reach: the least noise
-MOST_CERTAIN = -50.0  # log-beliefs below this are as good as impossible
-WITHIN = 2  # target points; an association this near is the same answer, since annotations err by one themselves
+RUN = 48  # neighbouring points with possibly correlated errors: a jolt lasts several degrees
+NOTHING = 1e-3  # of a point's information, so that no matrix is singular
+TINY = 1e-6  # of the scene's extent: the least noise
+MOST_CERTAIN = -50.0  # log-beliefs below this are treated as impossible
+WITHIN = 2  # target points; nearer associations count as equal, since annotations err by one themselves
 
 
 def motion_covariance(
     source: Tensor, support: Support, motions: Tensor, *, metric: str, scale: Tensor, noise: Tensor
 ) -> Uncertainty:
-    """Covariance of the motions that `motion.estimate` fits, and what they leave open.
+    """Covariance of the motions fitted by `motion.estimate`, and their unobserved directions.
 
     With the score g_i = w_i J_i^T M_i r_i of every point and H = sum_i w_i J_i^T M_i J_i, it is H^-1 K H^-1 where K sums
 
-        v sum_i w_i^2 J_i^T M_i J_i                          independent errors, v the larger of two returns' noise and what is left
-        1 / RUN sum over runs of points of (sum g) (sum g)^T     errors that neighbours share
-        (sum_i g_i) (sum_i g_i)^T                            the step that is still to be made: the fit stopped before.
+        v sum_i w_i^2 J_i^T M_i J_i                          independent errors, v the larger of two returns' noise and residuals
+        1 / RUN sum over runs of points of (sum g) (sum g)^T     errors shared by neighbours
+        (sum_i g_i) (sum_i g_i)^T                            the remaining step: the fit stopped before convergence.
 
-    It counts independent errors up to twice and what the choice of partners hides not at all; `Calibration.covariance_factor`
-    makes up for both. In a direction of which the points say less than `LEAST_SHARE`, only a prior is left: no point moves farther
-    than the scene reaches, and a rotation is any. Differentiable at a fixed choice of these directions. O(B C N).
+    Independent errors are counted up to twice, and errors hidden by the choice of partners are not counted;
+    `Calibration.covariance_factor` corrects for both. A direction with less information than `LEAST_SHARE` has only a prior: no
+    point moves farther than the scene's extent, and a rotation is arbitrary. Differentiable at a fixed set of these directions.
+    O(B C N).
 
     Args:
-        source: (B, N, 2) in beam order, N >= 1. support: of the last fit. motions: (B, C, 3) that came of it.
-        metric: `point`, else point-to-line: what holds a motion is the distance across the surface alone.
-        scale: () or (B,) residual at which a robust weight has fallen to a half. noise: (B,) standard deviation of a return.
+        source: (B, N, 2) in beam order, N >= 1. support: of the last fit. motions: (B, C, 3) its result.
+        metric: `point`, else point-to-line: only distances across the surface constrain a motion.
+        scale: () or (B,) residual at which a robust weight is one half. noise: (B,) standard deviation of a range.
             Both in the unit of the points.
     """
     reach = torch.linalg.vector_norm(source, dim=-1).detach().amax(-1).clamp(min=1e-3)  # (B,)
@@ -66,10 +67,10 @@ def motion_covariance(
     normal = torch.einsum("bcn,bcnia,bcnid->bcad", at.weights, at.jacobian, at.jacobian).double() / total[..., None, None]
     information, vectors = torch.linalg.eigh(normal.detach())
     seen = vectors * (information >= LEAST_SHARE)[..., None, :]
-    keep = seen @ vectors.mT  # projection onto what is observed
+    keep = seen @ vectors.mT  # projection onto the observed directions
     pretended = (
         LEAST_SHARE if MOTION_METRICS[metric].along_surface else 0.0
-    )  # by what is left of the tangents' noise, and by steps along the surface
+    )  # by the residual noise of the tangents, and by steps along the surface
     bread = keep @ (normal - pretended * identity) @ keep * total[..., None, None]
     length = at.length.double()
     prior = torch.stack([3 / (torch.pi * length) ** 2, *(1 / reach[:, None] ** 2).expand(2, *length.shape)], -1).diag_embed()
@@ -83,11 +84,11 @@ class Linearisation:
     """The fit's residuals near the motions, as functions of (theta L, x, y).
 
     Attributes:
-        weights: (B, C, N) of the points, robust where the fit's are.
-        residual: (B, C, N, 2) what of the distance to the partner counts, M r: across the surface, or all of it.
+        weights: (B, C, N) of the points, robust if the fit's are.
+        residual: (B, C, N, 2) the part of the distance to the partner that the metric uses, M r: across the surface, or all of it.
         jacobian: (B, C, N, 2, 3) its derivative, M J; M is a projection.
-        freedom: (B, C, N) directions in which a residual counts, the trace of M.
-        centre: (B, C, 2) centroid of the moved points. length: (B, C) L, at least the noise: points on one spot do not turn.
+        freedom: (B, C, N) number of residual components, the trace of M.
+        centre: (B, C, 2) centroid of the moved points. length: (B, C) L, at least the noise, as coincident points have no extent.
     """
 
     weights: Tensor
@@ -120,7 +121,7 @@ class Linearisation:
 
 
 def moved_tangents(source: Tensor, support: Support, motions: Tensor, noise: Tensor) -> Tensor:
-    """(B, C, N, 2) direction of the surface under every motion; 0 for a lonely partner. Arguments as in `motion_covariance`."""
+    """(B, C, N, 2) direction of the surface under every motion; 0 for an isolated partner. Arguments as in `motion_covariance`."""
     tangent, is_found = surface_tangents(source, support.weights.sum(1) > 0, noise)
     turned = se2.rotate(motions[..., :1], tangent[:, None])
     given = support.tangent[:, None]
@@ -128,7 +129,7 @@ def moved_tangents(source: Tensor, support: Support, motions: Tensor, noise: Ten
 
 
 def about_origin(local: Tensor, length: Tensor, offset: Tensor) -> Tensor:
-    """Covariance of (theta, tx, ty) from that of (theta L, x, y) about a centroid, where a turn moves t as well.
+    """Covariance of (theta, tx, ty) from that of (theta L, x, y) about a centroid, where a rotation changes t as well.
 
     local: (..., 3, 3). length: (...,) L. offset: (..., 2) t minus the centroid.
     """
@@ -141,9 +142,9 @@ def about_origin(local: Tensor, length: Tensor, offset: Tensor) -> Tensor:
 
 
 def shared_scores(score: Tensor) -> Tensor:
-    """(B, C, 3, 3) mean over all ways to cut the points into runs of `RUN` of the sum of the runs' squared scores.
+    """(B, C, 3, 3) sum of the squared scores of runs of `RUN` points, averaged over all offsets of the runs.
 
-    Padding and strangers to a cluster add nothing. score: (B, C, N, 3), in beam order.
+    Padding and points of other clusters contribute 0. score: (B, C, N, 3), in beam order.
     """
     flat = score.flatten(0, 1).mT  # (B C, 3, N)
     padded = nn.functional.pad(flat, (RUN - 1, RUN - 1))
@@ -152,13 +153,13 @@ def shared_scores(score: Tensor) -> Tensor:
 
 
 def surface_tangents(points: Tensor, mask: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Direction of the surface at every point, from a stretch that is long beside the noise.
+    """Direction of the surface at every point, from a stretch that is long compared with the noise.
 
     Args:
-        points: (B, N, 2) in beam order. mask: (B, N) points that count. noise: (B,) metres.
+        points: (B, N, 2) in beam order. mask: (B, N) points to use. noise: (B,) metres.
 
     Returns:
-        (B, N, 2) unit vectors along the main axis of the neighbouring points, and (B, N) where there is such an axis.
+        (B, N, 2) unit vectors along the main axis of the neighbouring points, and (B, N) whether there is such an axis.
     """
     padded = nn.functional.pad(points, (0, 0, NEIGHBOURS, NEIGHBOURS)).unfold(1, 2 * NEIGHBOURS + 1, 1)  # (B, N, 2, W)
     real = nn.functional.pad(mask, (NEIGHBOURS, NEIGHBOURS)).unfold(1, 2 * NEIGHBOURS + 1, 1) & mask[..., None]
@@ -178,7 +179,7 @@ def surface_tangents(points: Tensor, mask: Tensor, noise: Tensor) -> tuple[Tenso
 
 
 class Answers(Protocol):
-    """What confidences are read from: a `Prediction`, or a round's state."""
+    """Labels and beliefs from which confidences are computed: a `Prediction`, or a round's state."""
 
     @property
     def association(self) -> Tensor:
@@ -202,9 +203,9 @@ class Answers(Protocol):
 
 
 class Calibration(nn.Module):
-    """What was fitted so that confidences and covariances mean what they say (`learning.calibration_fit`).
+    """Calibration of confidences and covariances, fitted by `learning.calibration_fit`.
 
-    A confidence is sigmoid(slope * log-odds + offset) of the chosen label against the others: labels stay as they are.
+    A confidence is sigmoid(slope * log-odds + offset) of the chosen label against the others: labels are unchanged.
 
     Attributes:
         association, cluster: (2,) slope and offset.
@@ -222,7 +223,10 @@ class Calibration(nn.Module):
         self.register_buffer("covariance_factor", torch.tensor(1.0))
 
     def forward(self, prediction: Answers) -> tuple[Tensor, Tensor]:
-        """(B, N) confidences of associations, to be right within `WITHIN` target points, and of clusters, in [0, 1]."""
+        """Calibrated confidences in [0, 1], (B, N) of associations and (B, N) of clusters.
+
+        An association counts as right within `WITHIN` target points of the true one.
+        """
         association = self.association.to(prediction.log_association)
         cluster = self.cluster.to(prediction.log_cluster)
         return (

@@ -1,7 +1,7 @@
-"""Other pairs from a pair: mirrored, with lost returns, with more noise. Pure functions of (pair, generator); annotations follow.
+"""Augmentation of pairs: mirroring, lost returns, noise. Pure functions of (pair, generator); annotations are transformed too.
 
-The target in another frame is not a scan any more, whose rays start at 0, so that is drawn here (`frame_offset`) and done to the
-batch (`ScanPairBatch.displaced`).
+A target in another frame is not a scan any more, as its rays do not start at 0, so the offset is drawn here (`frame_offset`)
+and applied to the batch (`ScanPairBatch.displaced`).
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import torch
 from torchcrf_scan.learning.settings import AugmentConfig
 from torchcrf_scan.scan import MAX_RANGE_MARGIN, OUTLIER, Annotation, Bools, Floats, Ints, Scan, ScanPair
 
-USUAL_NOISE = 0.01  # metres, of a sensor that does not say
-NEAREST = 1e-3  # metres; a return is never nearer
-HANDS = np.array([-1.0, 1.0, -1.0])  # what a mirror does to (theta, tx, ty)
+USUAL_NOISE = 0.01  # metres, for sensors of unknown noise
+NEAREST = 1e-3  # metres; lower bound of noisy ranges
+HANDS = np.array([-1.0, 1.0, -1.0])  # signs of (theta, tx, ty) under mirroring
 
 
 def augment(pair: ScanPair, config: AugmentConfig, generator: torch.Generator) -> ScanPair:
-    """The pair varied by all that `config` says; the same generator gives the same pair."""
+    """The pair with all augmentations of `config`; a function of the generator's state."""
     pair = mirror(pair) if _uniform(generator) < config.mirror else pair
     pair = drop_returns(pair, config.dropout * _uniform(generator), generator)
     return add_noise(pair, config.noise * _uniform(generator), generator)
@@ -34,7 +34,7 @@ def _uniform(generator: torch.Generator) -> float:
 
 
 def mirror(pair: ScanPair) -> ScanPair:
-    """The pair with left and right exchanged; twice gives the pair again. Beams are counted from the other end."""
+    """The pair with left and right exchanged; an involution. Beams are counted from the other end."""
     guess = None if pair.initial_motion is None else np.asarray(pair.initial_motion, dtype=np.float64) * HANDS
     annotation = pair.annotation and _mirror_annotation(pair.annotation, pair.target.n_beams)
     return replace(
@@ -43,13 +43,13 @@ def mirror(pair: ScanPair) -> ScanPair:
 
 
 def _mirror_scan(scan: Scan) -> Scan:
-    """Bearings change their sign and rise again once the beams are reversed."""
+    """The mirrored scan: bearings change their sign, and reversing the beams makes them ascend again."""
     beam = scan.n_beams - 1 - scan.beam[::-1]
     return replace(scan, ranges=scan.ranges[::-1].copy(), bearings=-scan.bearings[::-1], beam=beam)
 
 
 def _mirror_annotation(truth: Annotation, target_beams: int) -> Annotation:
-    """Labels by reversed source beam, associations to reversed target beams, motions seen in the mirror."""
+    """Labels by reversed source beam, associations to reversed target beams, mirrored motions."""
     association = truth.association[::-1]
     return Annotation(
         association=np.where(association >= 0, target_beams - 1 - association, OUTLIER),
@@ -64,9 +64,9 @@ def _mirror_annotation(truth: Annotation, target_beams: int) -> Annotation:
 
 
 def drop_returns(pair: ScanPair, share: float, generator: torch.Generator) -> ScanPair:
-    """Both scans without a share of their returns, each return lost by itself.
+    """Both scans without a share of their returns, each return dropped independently.
 
-    A source return whose counterpart is lost is ignored: whether a neighbour would be one, nobody has annotated.
+    A source return whose counterpart is dropped is ignored: whether a neighbour would be one is not annotated.
     """
     if share <= 0:
         return pair
@@ -77,14 +77,14 @@ def drop_returns(pair: ScanPair, share: float, generator: torch.Generator) -> Sc
 
 
 def _drop(scan: Scan, share: float, generator: torch.Generator) -> tuple[Scan, Bools]:
-    """The scan with the returns that are left, and (n_beams,) whether a beam's return was lost."""
+    """The scan without the dropped returns, and (n_beams,) whether a beam's return was dropped."""
     keep = (torch.rand(len(scan), generator=generator, dtype=torch.float64) >= share).numpy()
     lost = scan.to_beams(~keep, False)
     return replace(scan, ranges=scan.ranges[keep], bearings=scan.bearings[keep], beam=scan.beam[keep]), lost
 
 
 def _without(truth: Annotation, source_lost: Bools, target_lost: Bools) -> Annotation:
-    partner_lost = (truth.association >= 0) & target_lost[truth.association]  # -1 looks at the last beam and does not count
+    partner_lost = (truth.association >= 0) & target_lost[truth.association]  # -1 indexes the last beam and is masked
     unknown = source_lost | partner_lost
     association: Ints = np.where(unknown, OUTLIER, truth.association)
     return replace(truth, association=association, cluster=np.where(unknown, OUTLIER, truth.cluster), ignore=truth.ignore | unknown)
@@ -94,19 +94,19 @@ def _without(truth: Annotation, source_lost: Bools, target_lost: Bools) -> Annot
 
 
 def add_noise(pair: ScanPair, amount: float, generator: torch.Generator) -> ScanPair:
-    """Noise on all ranges, `amount` times the sensor's; a sensor that states its noise states the sum. Labels stay."""
+    """Noise on all ranges, `amount` times the sensor's; a stated sensor noise becomes the combined one. Labels are unchanged."""
     if amount <= 0:
         return pair
     return replace(pair, source=_noisy(pair.source, amount, generator), target=_noisy(pair.target, amount, generator))
 
 
 def _noisy(scan: Scan, amount: float, generator: torch.Generator) -> Scan:
-    """Ranges stay inside the sensor's limits, so that no return gets lost."""
+    """Ranges are kept within the sensor's limits, so that no return becomes invalid."""
     noise = USUAL_NOISE if scan.range_noise is None else scan.range_noise
     error: Floats = amount * noise * torch.randn(len(scan), generator=generator, dtype=torch.float64).numpy()
     nearest = max(scan.range_min or 0.0, 0.0) + NEAREST
     farthest = np.inf if scan.range_max is None else scan.range_max - MAX_RANGE_MARGIN - NEAREST
-    low, high = np.minimum(scan.ranges, nearest), np.maximum(scan.ranges, farthest)  # a return at the limit stays where it is
+    low, high = np.minimum(scan.ranges, nearest), np.maximum(scan.ranges, farthest)  # a return at the limit is unchanged
     stated = None if scan.range_noise is None else noise * float(np.hypot(1.0, amount))
     return replace(scan, ranges=np.clip(scan.ranges + error, low, high), range_noise=stated)
 

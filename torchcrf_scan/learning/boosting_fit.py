@@ -1,4 +1,4 @@
-"""AdaBoost over decision stumps, fitted by scikit-learn, handed over as tables (spec 2.2, 2.3)."""
+"""AdaBoost over decision stumps, fitted by scikit-learn and converted to tables (spec 2.2, 2.3)."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def fit_stumps(inputs: np.ndarray, positive: np.ndarray, stumps: int) -> StumpEn
     """Discrete AdaBoost on class-balanced examples.
 
     Args:
-        inputs: (P, F) float32. positive: (P,) bool. stumps: at most; fewer where a split is perfect.
+        inputs: (P, F) float32. positive: (P,) bool. stumps: maximum number; fewer if a split is perfect.
 
     Returns:
         The ensemble, H = decision_function * sum of estimator weights / 4 (scikit-learn's weights are twice AdaBoost's alpha and
-        its decision function is 2 H over their sum); the zero ensemble where one class is missing.
+        its decision function is 2 H over their sum); the zero ensemble if one class is missing.
     """
     from sklearn.ensemble import AdaBoostClassifier
     from sklearn.tree import DecisionTreeClassifier
@@ -49,9 +49,9 @@ def fit_stumps(inputs: np.ndarray, positive: np.ndarray, stumps: int) -> StumpEn
 
 
 def stump_of(tree: object) -> tuple[int, float, float, float]:
-    """(feature, threshold, left sign, right sign); a tree that did not split says the same on both sides.
+    """(feature, threshold, left sign, right sign); both signs are equal for a tree without a split.
 
-    The threshold is rounded down to float32, which decides float32 inputs just as the float64 one does.
+    The threshold is rounded down to float32, which splits float32 inputs exactly as the float64 one does.
     """
     sign = np.where(tree.value[:, 0, 1] > tree.value[:, 0, 0], 1.0, -1.0)  # type: ignore[attr-defined]
     if tree.node_count == 1:  # type: ignore[attr-defined]
@@ -91,7 +91,7 @@ def data_examples(
 def sample_targets(
     truth: Tensor, moved: Tensor, target: Tensor, target_mask: Tensor, count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Wrong targets (B, N, count) and which of them may be used: never the true one or, as annotators err by one, its neighbour."""
+    """Wrong targets (B, N, count) and their mask: never the true one or, as annotators err by one, its neighbour."""
     B, N = truth.shape
     M = target.shape[1]
     near_index = max(1, count // 5) if count > 1 else 0
@@ -116,7 +116,7 @@ def sample_targets(
 def outlier_examples(
     view: PairView, plugins: PlugIns, scales: Scales, data_booster: StumpEnsemble, inference: InferenceConfig
 ) -> tuple[Tensor, Tensor]:
-    """Source points: (P, 14) inputs reduced over the candidates of the decoding, and (P,) whether the truth is an outlier."""
+    """Source points: (P, 14) inputs reduced over the candidates of inference, and (P,) whether the point is a true outlier."""
     batch = view.batch
     assert batch.truth is not None
     found = find_candidates(view, plugins.motions, plugins.active, inference)
@@ -146,8 +146,8 @@ def fit_boosters(
     """Data booster, then the outlier booster on its margins.
 
     Args:
-        most: examples of each at most, 0: all.
-        hidden: local channels that neither may look at.
+        most: maximum number of examples of each, 0: all.
+        hidden: local channels excluded from both.
     """
     boosters = Boosters(stumps)
     both = list(zip(views, plugins, strict=True))
@@ -163,7 +163,7 @@ def fit_boosters(
 def _stack(
     parts: Sequence[tuple[Tensor, Tensor]], most: int, hidden: Sequence[int], generator: torch.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs and classes of all parts, thinned at random to `most` (0: not); no tree splits a hidden channel, which is constant."""
+    """Inputs and classes of all parts, subsampled to `most` (0: all); hidden channels are constant, so never split on."""
     inputs, positive = torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
     if 0 < most < len(inputs):
         kept = torch.randperm(len(inputs), generator=generator)[:most].to(inputs.device)

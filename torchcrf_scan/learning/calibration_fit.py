@@ -1,4 +1,4 @@
-"""Fits what turns log-odds into confidences and residuals into covariances, on annotated pairs and a fitted model's answers."""
+"""Fits the calibration of confidences and covariances on annotated pairs and the predictions of a fitted model."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import Bools, Floats, ScanPair
 
-DOMINATED = 1 / 3  # share of a scan's known points that move, from which on movers dominate it
-FEWEST_PAIRS = 10  # that a factor of the covariances is fitted on
+DOMINATED = 1 / 3  # share of moving points in a scan above which movers dominate it
+FEWEST_PAIRS = 10  # minimum number of pairs to fit the factor of the covariances
 FIT_QUANTILE = 0.9  # at which the covariances' factor is fitted: up to a tenth of the pairs may have a wrong background
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """Answers for annotated pairs beside the truth: P returns and Q pairs with a known background motion.
+    """Predictions for annotated pairs compared with the truth: P returns and Q pairs with a known background motion.
 
     Attributes:
         association_log_odds, cluster_log_odds: (P,).
         association_right, association_exact, cluster_right: (P,) bool; right is within `WITHIN` target beams.
-        nees: (Q,) normalised errors of the background's motion.
+        nees: (Q,) normalised estimation errors squared of the background's motion.
     """
 
     association_log_odds: Floats
@@ -44,13 +44,13 @@ class Judged:
 
     @classmethod
     def nothing(cls) -> Judged:
-        """No answers."""
+        """An instance without returns and pairs."""
         number, flag = np.zeros(0), np.zeros(0, dtype=bool)
         return cls(number, flag, flag, number, flag, number)
 
     @classmethod
     def joined(cls, parts: Sequence[Judged]) -> Judged:
-        """All parts as one. Raises ValueError for none."""
+        """Concatenates all parts. Raises ValueError for none."""
         if not parts:
             raise ValueError("parts: expected at least one, got none")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
@@ -60,10 +60,9 @@ class Judged:
 def calibrate(model: JointScanCRF, material: Sequence[Material]) -> None:
     """Fits the calibration of a fitted model in place, on the pairs and from the starts that it was fitted on.
 
-    The scans are those from before they were disturbed: disturbance moves whole scans, and covariances that account for it would
-    be four to six times too large for others. Scans that movers dominate are left out, where there are others: those are read right
-    or wrong as a whole, of which a point's belief knows nothing. What was fitted before does not matter. A model of one chain keeps
-    the default.
+    The undisturbed scans are used: disturbance moves whole scans, and covariances that account for it would be four to six times
+    too large otherwise. Scans dominated by movers are left out if there are others: they are right or wrong as a whole, which the
+    belief of a single point does not reflect. An earlier calibration has no influence. A model of one chain keeps the default.
     """
     model.calibration.load_state_dict(Calibration().state_dict())
     if not (model.config.has_association and model.config.has_clusters):
@@ -79,7 +78,7 @@ def calibrate(model: JointScanCRF, material: Sequence[Material]) -> None:
 
 
 def moving_share(pair: ScanPair) -> float:
-    """Share of the returns with a known body that belong to movers; 0 where there are none."""
+    """Share of the returns with a known body that belong to movers; 0 without known bodies."""
     assert pair.annotation is not None
     body = pair.annotation.body[~pair.annotation.ignore]
     return float((body > 0).sum() / max((body >= 0).sum(), 1))
@@ -90,7 +89,7 @@ def judge(pairs: Sequence[ScanPair], prediction: Prediction, counts: Sequence[bo
     """Compares the prediction of a batch with the annotation of its B pairs.
 
     Args:
-        counts: (B,) which of the pairs count; None: all.
+        counts: (B,) pairs to include; None: all.
 
     Raises:
         ValueError: a pair without annotation.
@@ -117,9 +116,10 @@ def judge(pairs: Sequence[ScanPair], prediction: Prediction, counts: Sequence[bo
 
 
 def fit_calibration(judged: Judged) -> Calibration:
-    """Both chains' slopes and offsets, and the factor of the covariances; what there are too few answers for stays as it is.
+    """Both chains' slopes and offsets, and the factor of the covariances; the default is kept where there is too little data.
 
-    judged: with covariances as `motion_covariance` gives them, not yet multiplied.
+    Args:
+        judged: with covariances from `motion_covariance`, before multiplication by a factor.
     """
     calibration = Calibration()
     if not len(judged.association_right):
@@ -134,13 +134,13 @@ def fit_calibration(judged: Judged) -> Calibration:
 def fit_confidence(log_odds: ArrayLike, is_right: ArrayLike) -> Floats:
     """(2,) slope >= 0 and offset of the confidence sigmoid(slope * log-odds + offset) by least negative log-likelihood (Platt).
 
-    With his targets (n + 1) / (n + 2) and 1 / (n + 2) in place of 1 and 0, so that it is finite for answers that are all right.
+    With Platt's targets (n + 1) / (n + 2) and 1 / (n + 2) instead of 1 and 0, so that it is finite even if all labels are right.
 
     Args:
         log_odds: (P,). is_right: (P,) bool.
 
     Raises:
-        ValueError: no answers.
+        ValueError: empty input.
     """
     values, right = np.asarray(log_odds, dtype=np.float64), np.asarray(is_right, dtype=bool)
     if not len(values) or values.shape != right.shape:
@@ -158,15 +158,15 @@ def fit_confidence(log_odds: ArrayLike, is_right: ArrayLike) -> Floats:
 
 
 def fit_covariance_factor(nees: ArrayLike, quantile: float = FIT_QUANTILE, freedom: int = MOTION_FREEDOM) -> float:
-    """The factor on covariances that gives normalised errors a quantile of the chi-square: motions that are wrong do not count.
+    """The covariances' factor that matches a quantile of the normalised errors to the chi-square's; robust against wrong motions.
 
     Args:
         nees: (Q,) with the factor 1.
-        quantile: in (0, 1); 0.5 is the most robust, but errors have longer tails than the normal, and then promises too much.
-        freedom: degrees of the chi-square.
+        quantile: in (0, 1); 0.5 is the most robust, but errors are heavy-tailed, and covariances are then too small.
+        freedom: degrees of freedom of the chi-square.
 
     Raises:
-        ValueError: no errors.
+        ValueError: empty input.
     """
     values = np.asarray(nees, dtype=np.float64)
     if not len(values):

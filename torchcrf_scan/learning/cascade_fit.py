@@ -1,4 +1,4 @@
-"""Fits the two chains apart: CRF-Matching, then CRF-Clustering on its associations of pairs that its boosters have not seen."""
+"""Fits the two chains separately: CRF-Matching, then CRF-Clustering on its associations, with out-of-fold boosters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchcrf_scan.model import ClusteringCRF, MatchingCRF
 def fit_cascade(material: Sequence[Material], config: Config, watch: Mapping[str, dict[str, Watch]] | None = None) -> Cascade:
     """The fitted cascade. watch: callbacks of the weight fits, of `matching` and of `clustering`, see `fit`."""
     watch = watch or {}
-    bare = replace(config.model, encoder=EncoderConfig())  # whose potentials are learned for both chains together
+    bare = replace(config.model, encoder=EncoderConfig())  # its potentials are learned for both chains together
     matching, clustering = MatchingCRF(bare), ClusteringCRF(bare)
     margins = fit(matching, material, config.learning, watch.get("matching"))
     fed = []

@@ -1,4 +1,4 @@
-"""Checkpoints that survive a killed process and a full disk."""
+"""Checkpoints, written atomically, so that a killed process or a full disk cannot damage them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from torchcrf_scan.whole_file import write_whole
 log = logging.getLogger(__name__)
 
 NAME = "checkpoint.pt"
-FORMAT = 1  # of what is written
+FORMAT = 1  # version of the file format
 
 
 @dataclass(slots=True)
@@ -27,8 +27,8 @@ class Store:
     """The checkpoint of a run folder.
 
     Attributes:
-        folder: the run folder. settings: by name, what a run that goes on must not change.
-        last: step of the last good checkpoint, None before the first.
+        folder: the run folder. settings: by name, those that must be equal when a run is resumed.
+        last: step of the last valid checkpoint, None before the first.
     """
 
     folder: Path
@@ -37,11 +37,11 @@ class Store:
 
     @property
     def path(self) -> Path:
-        """The file."""
+        """Path of the checkpoint."""
         return self.folder / NAME
 
     def write(self, step: int, state: dict[str, Any]) -> bool:
-        """Writes a checkpoint; where that fails says so, keeps the old one and returns False: training can go on without."""
+        """Writes a checkpoint; on failure logs a warning, keeps the old one and returns False, so that training can continue."""
         content = io.BytesIO()
         torch.save({"format": FORMAT, "settings": self.settings, "random": random_state(), **state}, content)
         try:
@@ -54,12 +54,12 @@ class Store:
         return True
 
     def read(self) -> dict[str, Any] | None:
-        """The last good checkpoint, None where there is none yet.
+        """The last valid checkpoint, or None.
 
         Raises:
-            ValueError: one of other settings, whose names it tells, or a file that is none.
+            ValueError: a checkpoint with other settings, which are listed, or an invalid file.
         """
-        for left in self.folder.glob(f".{NAME}.*"):  # of a process that was killed while it wrote
+        for left in self.folder.glob(f".{NAME}.*"):  # of a process that was killed while writing
             left.unlink()
         if not self.path.exists():
             return None
@@ -79,7 +79,7 @@ class Store:
 
 
 def load_weights(model: JointScanCRF, origin: str | JointScanCRF) -> None:
-    """Takes over the weights of a model, or of a saved one by its folder or name; parts that it has not stay as they are.
+    """Loads the weights of a model, or of a saved one by its folder or name; parts missing there are unchanged.
 
     Raises:
         ValueError: no such model, or one of other features.
@@ -93,7 +93,7 @@ def load_weights(model: JointScanCRF, origin: str | JointScanCRF) -> None:
 
 
 def random_state() -> dict[str, Any]:
-    """The states of all global generators, in types that are safe to load."""
+    """The states of all global random generators, in types that are safe to load."""
     words = np.random.get_state(legacy=False)
     assert isinstance(words, dict)
     version, numbers, spare = random.getstate()
@@ -111,7 +111,7 @@ def random_state() -> dict[str, Any]:
 
 
 def set_random_state(state: dict[str, Any]) -> None:
-    """Puts all global generators where they were."""
+    """Restores the states of all global random generators."""
     torch.set_rng_state(state["torch"])
     words = state["numpy"]
     np.random.set_state({**words, "state": {**words["state"], "key": words["state"]["key"].numpy().astype(np.uint32)}})

@@ -1,4 +1,4 @@
-"""What real recordings do to scans and a simulator of ideal ones does not: the sensor moves while it sweeps, and it tilts."""
+"""Disturbances of real recordings that the ideal simulator lacks: the sensor moves while it sweeps, and it tilts."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ BUMP_BEAMS = 8  # neighbouring beams that share an error
 
 
 def skew(points: Tensor, mask: Tensor, amount: Tensor, generator: torch.Generator) -> Tensor:
-    """Points as a sensor returns them that goes on moving during its sweep, relative to the middle of it.
+    """Scan distortion by motion of the sensor during a sweep, relative to the middle of the sweep.
 
     Args:
-        points: (B, P, 2). mask: (B, P). amount: (B,) metres that the ends of the sweep are displaced by, typically.
+        points: (B, P, 2). mask: (B, P). amount: (B,) typical displacement of the ends of the sweep, metres.
     """
     count = mask.sum(-1, keepdim=True).clamp(min=2)
     phase = 2 * torch.arange(points.shape[1], device=points.device) / (count - 1) - 1  # (B, P), -1 to 1
@@ -31,7 +31,7 @@ def skew(points: Tensor, mask: Tensor, amount: Tensor, generator: torch.Generato
 
 
 def bump(points: Tensor, amount: Tensor, generator: torch.Generator) -> Tensor:
-    """Range errors that neighbouring beams share: a tilted sensor hits other heights. points: (B, P, 2); amount: (B,) metres."""
+    """Range errors shared by neighbouring beams, as of a tilted sensor. points: (B, P, 2); amount: (B,) metres."""
     knots = torch.randn(len(points), 1, points.shape[1] // BUMP_BEAMS + 2, generator=generator)
     error = torch.nn.functional.interpolate(knots, size=points.shape[1], mode="linear", align_corners=True)[:, 0].to(points)
     ranges = torch.linalg.vector_norm(points, dim=-1, keepdim=True).clamp(min=1e-6)
@@ -39,7 +39,7 @@ def bump(points: Tensor, amount: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def disturb(batch: ScanPairBatch, strength: float, generator: torch.Generator) -> ScanPairBatch:
-    """Skews and bumps every source scan by a random share of `strength` units of the pair's resolution; labels stay."""
+    """Skews and bumps every source scan by a random share of `strength` units of the pair's resolution; labels are unchanged."""
     share = torch.rand(2, len(batch), generator=generator).to(batch.source)
     amount = strength * share * resolution(batch)
     source = skew(batch.source, batch.source_mask, amount[0], generator)

@@ -1,6 +1,6 @@
-"""Learning a model from annotated pairs, stage by stage: scales, boosters, association weights, clustering weights, movers' worth.
+"""Staged fit of a model to annotated pairs: scales, boosters, association weights, clustering weights, potential of movers.
 
-Everything that is fitted is fitted on the given pairs alone, so a fold of a cross-validation is one call.
+Everything is fitted on the given pairs only, so a fold of a cross-validation is one call.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, LOCAL_CHANNELS
 from torchcrf_scan.variants.register import ONE_CHAINS, OneChain
 
-Margins = dict[int, Boosters]  # by out-of-fold part, boosters that have not seen it
+Margins = dict[int, Boosters]  # by fold, boosters fitted without it
 
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
-    """Material as one model sees it, with all that is taken as observed."""
+    """Training material with its plug-ins, prepared for one model."""
 
     view: PairView
     start: Start
@@ -52,12 +52,12 @@ def fit(
     """Fits scales, boosters and weights of `model`, in place.
 
     Args:
-        watch: callbacks of the weight fits, by chain: `association`, `clustering`; or of the one fit, by coupling: `lattice`.
-        features_of: a model with both chains that was fitted on the same material, and what its fit returned: scales and boosters
-            are then taken from there.
+        watch: callbacks of the weight fits, by chain: `association`, `clustering`; or of the single fit, by coupling: `lattice`.
+        features_of: a model with both chains that was fitted on the same material, and the return value of its fit: scales and
+            boosters are then taken from there.
 
     Returns:
-        By fold, boosters that have not seen it; none for the clustering chain alone.
+        By fold, boosters fitted without it; empty for the clustering chain alone.
     """
     watch = watch or {}
     generator = torch.Generator().manual_seed(config.seed)
@@ -88,7 +88,7 @@ def fit_features(
     generator: torch.Generator,
     features_of: tuple[JointScanCRF, Margins] | None,
 ) -> Margins:
-    """Scales and boosters, fitted or taken over."""
+    """Scales and boosters, fitted or taken from `features_of`."""
     if features_of is not None:
         other, margins = features_of
         model.scales.load_state_dict(other.scales.state_dict())
@@ -107,7 +107,7 @@ def fit_one_chain(
     config: LearningConfig,
     watch: Watch | None,
 ) -> None:
-    """All weights at once, of a coupling that decides both labels together; no association is plugged in (`predicted_share`)."""
+    """Fits all weights jointly, for a coupling that decides both labels together; no association plug-ins (`predicted_share`)."""
     inference = model.config.inference
     features = (one_chain(of.view, of.plugins, model.scales, margins[of.fold], inference) for of in lessons)
     live = torch.cat(live_weights(model.config.features))
@@ -127,7 +127,7 @@ def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generat
 
 
 def fit_all_boosters(model: JointScanCRF, lessons: Sequence[Lesson], config: LearningConfig, generator: torch.Generator) -> Margins:
-    """Fits the model's boosters on all pairs; returns by fold those of the other folds (margins of unseen pairs, spec 2.5)."""
+    """Fits the model's boosters on all pairs; returns by fold those fitted on the other folds (out-of-fold margins, spec 2.5)."""
 
     def fit_on(part: Sequence[Lesson]) -> Boosters:
         return fit_boosters(
@@ -152,7 +152,7 @@ def fit_all_boosters(model: JointScanCRF, lessons: Sequence[Lesson], config: Lea
 
 
 def association_chain(model: JointScanCRF, lesson: Lesson, margins: Boosters) -> Chain:
-    """The lesson's association features with margins of boosters that have not seen it."""
+    """The lesson's association features with out-of-fold margins."""
     return pseudo_likelihood.association_chain(lesson.view, lesson.plugins, model.scales, margins, model.config.inference)
 
 
@@ -167,7 +167,7 @@ def predict_association(model: JointScanCRF, lesson: Lesson, margins: Boosters) 
 def clustering_chain(
     model: JointScanCRF, lesson: Lesson, predicted: Tensor, config: LearningConfig, generator: torch.Generator
 ) -> Chain:
-    """The lesson's clustering features, with predicted associations for some pairs; for all where the chain stands alone (A-28)."""
+    """The lesson's clustering features, with predicted associations for some pairs; for all without the other chain (A-28)."""
     share = config.predicted_share if model.config.has_association else 1.0
     plugins = mix_associations(lesson.plugins, predicted, share, generator)
     return pseudo_likelihood.clustering_chain(lesson.view, plugins, model.scales)
@@ -175,7 +175,7 @@ def clustering_chain(
 
 @torch.no_grad()
 def set_weights(model: JointScanCRF, chain: str, values: Tensor) -> None:
-    """Writes (23,) or (20,) weights into the named parameters; what the model does not have is 0 there."""
+    """Writes (23,) or (20,) weights into the named parameters; those of left-out features are skipped."""
     names, weights = {
         "association": (ASSOCIATION_WEIGHTS, model.association_weights),
         "clustering": (CLUSTERING_WEIGHTS, model.clustering_weights),

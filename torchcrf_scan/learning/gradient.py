@@ -1,7 +1,7 @@
-"""First-order training: AdamW on portions of pairs, in one process or many, that can be broken off and gone on with anywhere.
+"""First-order training: AdamW on portions of pairs, in one or more processes, resumable at any checkpoint.
 
-A step's pairs come in parts of fixed size, whatever the number of processes; the gradients of the parts are added up, each weighted
-by its known nodes. So many processes descend as one does, and a run that goes on does what it would have done.
+The pairs of a step are split into parts of fixed size, independent of the number of processes; the parts' gradients are summed,
+weighted by their annotated nodes. So the result does not depend on the number of processes, nor on interruptions.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """One step.
+    """Statistics of one step.
 
     Attributes:
-        step: steps done. terms: losses per known node. norm: of the gradient before it was cut, `norms` of the model's every part.
-        rate: learning rate. pairs: of all processes. nodes: known ones among their points. seconds: that the step took.
+        step: number of steps done. terms: losses per annotated node. norm: of the gradient before clipping, `norms` of each
+            part of the model.
+        rate: learning rate. pairs: of all processes. nodes: annotated ones among their points. seconds: duration of the step.
     """
 
     step: int
@@ -52,17 +53,17 @@ class Report:
 
 
 class Monitor(Protocol):
-    """Who looks on. Only the first process has one."""
+    """Observer of the training; only the first process has one."""
 
     def stepped(self, model: JointScanCRF, report: Report) -> None:
-        """After every step."""
+        """Called after every step."""
 
     def validated(self, step: int, model: JointScanCRF, losses: dict[str, float], answers: Answers) -> None:
-        """After every look at the validation pairs."""
+        """Called after every validation."""
 
 
 class Learner:
-    """A model and all that changes while it learns."""
+    """A model with the state of its training."""
 
     def __init__(self, model: JointScanCRF, config: GradientConfig, ranks: Ranks) -> None:
         self.model, self.config, self.ranks = model.to(ranks.device), config, ranks
@@ -74,7 +75,7 @@ class Learner:
         self.step = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that decides how the training goes on."""
+        """The state from which training can be resumed."""
         return {
             "step": self.step,
             "model": self.model.state_dict(),
@@ -85,7 +86,7 @@ class Learner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from a state, of which it takes a copy: the optimiser would write into it."""
+        """Restores a state, of which it takes a copy, because the optimiser writes into it."""
         state = copy.deepcopy(state)
         self.step, self.best = state["step"], state["best"]
         self.model.load_state_dict(state["model"])
@@ -118,7 +119,7 @@ class Learner:
         return Report(self.step, means, norm, norms, rate, self.config.batch_size, total, time.perf_counter() - began)
 
     def _average(self, sums: dict[str, Tensor], nodes: Tensor) -> tuple[dict[str, float], int]:
-        """Makes sums over nodes, the gradients among them, means over the nodes of all processes: one message for everything."""
+        """Turns sums over nodes, gradients included, into means over the nodes of all processes, in a single message."""
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for _, p in self.parameters]
         flat = torch.cat([*(g.double().flatten() for g in gradients), torch.stack([*sums.values(), nodes])])
         flat = self.ranks.sum(flat)
@@ -130,7 +131,7 @@ class Learner:
         return dict(zip(sums, terms[:-1].tolist(), strict=True)), total
 
     def _finish(self) -> tuple[float, dict[str, float]]:
-        """Cuts the gradient; leaves it out where it is not finite. Returns its norm, and that of every part of the model."""
+        """Clips the gradient and skips the step if it is not finite. Returns its norm, and that of every part of the model."""
         squares: dict[str, float] = {}
         for name, parameter in self.parameters:
             assert parameter.grad is not None
@@ -147,13 +148,13 @@ class Learner:
         return norm, {name: value**0.5 for name, value in squares.items()}
 
     def keep_best(self, loss: float) -> None:
-        """Takes a validation loss into account."""
+        """Updates the best weights and the early stopping by a validation loss."""
         if self.stopping.look(self.step, loss):
             self.best = copy.deepcopy(self.model.state_dict())
 
 
 def has_amp(config: GradientConfig, device: torch.device) -> bool:
-    """Whether to calculate in bfloat16 where that is good enough: asked for, and on a GPU that has it."""
+    """Whether to use bfloat16: enabled in the settings, and supported by the GPU."""
     return config.amp and device.type == "cuda" and torch.cuda.is_bf16_supported()
 
 
@@ -171,11 +172,11 @@ def train_by_gradient(
     """Descends `config.first_order` from the model's weights or a checkpoint; leaves the best weights in the model, on the CPU.
 
     Args:
-        pairs: that samples are drawn from where not all are simulated. held_out: validation pairs; none: the last weights are best.
-        store: where the first process writes checkpoints. state: one of them to go on from; the same in every process.
+        pairs: source of the samples that are not simulated. held_out: validation pairs; empty: the last weights are kept.
+        store: written by the first process. state: a checkpoint to resume, the same in every process.
 
     Raises:
-        ValueError: the parts of a step cannot be shared out among the processes.
+        ValueError: the parts of a step cannot be divided evenly among the processes.
     """
     gradient = config.gradient
     if gradient.batch_size // gradient.part % ranks.world:

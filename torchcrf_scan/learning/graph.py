@@ -1,4 +1,4 @@
-"""The module's graph for TensorBoard, which draws functions of tensors only."""
+"""The module's graph for TensorBoard, which traces functions of tensors only."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import JointScanCRF
 
 POINTS = 8  # of each scan
-ROUNDS = 1  # of the iterations that are drawn; more repeat the same boxes
+ROUNDS = 1  # iterations to draw; more would repeat the same nodes
 
 
 def beginning(batch: ScanPairBatch, start: Start, points: int) -> tuple[ScanPairBatch, Start]:
-    """The first points of both scans of the first pair, its movers decided: weighing them up is a graph of its own."""
+    """The first points of both scans of the first pair, its movers already selected: selection would add its own graph."""
     row, n = slice(0, 1), slice(0, points)
     part = replace(
         batch[row].without_truth(),
@@ -38,11 +38,11 @@ def beginning(batch: ScanPairBatch, start: Start, points: int) -> tuple[ScanPair
 
 
 def write_graph(writer: SummaryWriter, model: JointScanCRF, batch: ScanPairBatch, start: Start) -> None:
-    """Writes the graph of the model's first round on the beginning of one pair: tracing repeats what is done point by point.
+    """Writes the graph of the model's first round on a few points of one pair: tracing unrolls the loop over points.
 
-    batch, start: B pairs, of which the first is taken.
+    batch, start: B pairs, of which the first is used.
     """
     inputs = decoder_inputs(*beginning(batch, start, POINTS))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # tracing tells of every shape that it takes for granted, which is the point here
+        warnings.simplefilter("ignore")  # tracing warns of every shape that it fixes, which is intended here
         writer.add_graph(UnrolledDecoder(model, ROUNDS), tuple(inputs.values()), use_strict_trace=False)

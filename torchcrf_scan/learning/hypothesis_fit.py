@@ -1,4 +1,4 @@
-"""Fits the score that accepts movers (design finding 14) by logistic regression on annotated pairs."""
+"""Fits the score of hypothesised movers (design finding 14) by logistic regression on annotated pairs."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from torchcrf_scan.search.survey import Survey, grids_of, survey_at
 log = logging.getLogger(__name__)
 
 MOST_MOVERS = 6
-IGNORED = -2  # body of a point that nobody annotated
-FOUND_SHARE = 0.15  # of the views start from the background that is found, as in use; the others, cheaper, from the disturbed truth
+IGNORED = -2  # body of an unannotated point
+FOUND_SHARE = 0.15  # of the views start from the estimated background, as in use; the others, cheaper, from the disturbed truth
 BACKGROUND_ERROR = 0.5  # units
-BUMP = 0.5  # units of range error that neighbouring beams share: a tilted sensor hits other heights
-SKEW = 0.3  # units that a scan's ends are displaced by: the sensor moves while it turns
+BUMP = 0.5  # units of range error shared by neighbouring beams: a tilted sensor hits other heights
+SKEW = 0.3  # units by which a scan's ends are displaced: the sensor moves while it turns
 KEPT_BEAMS = (0.5, 1.0)
-PURE = 0.7  # share of a mover's points in the members of a hypothesis that is taken as its
+PURE = 0.7  # share of one mover's points among the members above which a hypothesis is that mover's
 TOLERANCE, TOLERANCE_SHARE = 1.0, 0.12  # units and share of the displacement up to which a motion is right
 THRESHOLDS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)
-FALSE_COST = 2.0  # a false mover is as bad as that many missed ones
-VIEWS = 3  # of every pair
-REGULARISATION = 0.03  # inverse; looser weights fit the simulator, not the world
+FALSE_COST = 2.0  # weight of a false mover relative to a missed one
+VIEWS = 3  # per pair
+REGULARISATION = 0.03  # inverse strength; weaker regularisation overfits the simulator
 MODEL_CAR = SimulatorConfig(scale=0.1, fov=360.0, beams=360, range_max=9.0, dropout=0.3, dt=0.24)
 MIXTURE = (  # share and world
     (0.30, SimulatorConfig()),
@@ -53,11 +53,11 @@ MIXTURE = (  # share and world
 
 @dataclass(frozen=True, slots=True)
 class HypothesisView:
-    """One annotated pair as the fit sees it: what a background leaves, the hypotheses with their features, and which are right.
+    """One annotated pair as seen by the fit: hypotheses for the points unexplained by a background, their features and labels.
 
     Attributes:
-        survey: of the disturbed pair at a background that may be found.
-        label: (H,) 1 right, 0 wrong, -1 neither.
+        survey: of the disturbed pair at a background as the search may find it.
+        label: (H,) 1 right, 0 wrong, -1 undecided.
         body: (P,) true mover of every source point.
     """
 
@@ -66,7 +66,7 @@ class HypothesisView:
     body: Ints
 
     def members(self, which: Ints) -> Bools:
-        """(G, P) the source points that the hypotheses (G,) move."""
+        """(G, P) the source points moved by the hypotheses (G,)."""
         return members_of(self.survey.hypotheses, which, len(self.body))
 
 
@@ -80,13 +80,13 @@ def simulate_mixture(count: int, seed: int) -> list[ScanPair]:
 
 
 def fit_mixture(count: int = 110, seed: int = 0) -> HypothesisScore:
-    """The score fitted on simulated pairs alone; the defaults give what `HypothesisScore` begins with. Takes minutes."""
+    """The score fitted on simulated pairs alone; default arguments give the initial `HypothesisScore`. Takes minutes."""
     pairs = simulate_mixture(count, seed)
     return fit_hypothesis_score([view for k, pair in enumerate(pairs) for view in view_pair(pair, seed + k, views=2)])
 
 
 def view_pair(pair: ScanPair, seed: int, views: int = VIEWS) -> list[HypothesisView]:
-    """The annotated pair seen `views` times with other noise, beams and background error."""
+    """`views` views of the annotated pair with different noise, beams and background errors."""
     generator = torch.Generator().manual_seed(seed)
     return [view for _ in range(views) if (view := _view(pair, generator)) is not None]
 
@@ -95,7 +95,7 @@ def fit_hypothesis_score(seen: Sequence[HypothesisView]) -> HypothesisScore:
     """Fits weights and threshold.
 
     Returns:
-        The fitted score, or the default one where the pairs hold no mover, or nothing else.
+        The fitted score; the default one unless the pairs hold both right and wrong hypotheses.
     """
     features = np.concatenate([np.zeros((0, len(FEATURES))), *(view.survey.features for view in seen)])
     label = np.concatenate([np.zeros(0, np.int64), *(view.label for view in seen)])
@@ -121,7 +121,7 @@ def fit_logistic(features: Tensor, label: Tensor) -> HypothesisScore:
 
 
 def _view(pair: ScanPair, generator: torch.Generator) -> HypothesisView | None:
-    """The pair disturbed as real recordings are; None where a scan is left without points."""
+    """The pair disturbed like real recordings; None if a scan is left without points."""
     assert pair.annotation is not None
     whole = pair_of(ScanPairBatch.collate([pair]), 0)
     kept = _thin(len(pair.source), generator), _thin(len(pair.target), generator)
@@ -147,24 +147,24 @@ def _view(pair: ScanPair, generator: torch.Generator) -> HypothesisView | None:
 
 
 def _disturb(pair: Pair, unit: float, generator: torch.Generator) -> Floats:
-    """(P, 2) the source as a sensor sees it that moves and tilts. unit: metres."""
+    """(P, 2) source points with the distortions of a moving and tilting sensor. unit: metres."""
     points, metres = torch.from_numpy(pair.source)[None], torch.tensor([unit], dtype=torch.float64)
     skewed = skew(points, torch.ones(points.shape[:2], dtype=torch.bool), SKEW * metres, generator)
     return array_of(bump(skewed, BUMP * metres, generator)[0])
 
 
 def _thin(count: int, generator: torch.Generator) -> Ints:
-    """Index of the beams that are kept; every other time all are."""
+    """Index of the beams kept by random thinning; every other time all are kept."""
     share = torch.empty(()).uniform_(*KEPT_BEAMS, generator=generator)
     share = torch.where(torch.rand((), generator=generator) < 0.5, share, torch.ones(()))
     return (torch.rand(count, generator=generator) < share).nonzero()[:, 0].numpy()
 
 
 def label_hypotheses(survey: Survey, members: Bools, body: Ints, motions: Floats) -> Ints:
-    """(H,) 1: moves mostly one true mover, and as it moved; 0: neither; -1: between, a mover that hardly moved, or not annotated.
+    """(H,) 1: moves mostly one true mover, by its motion; 0: neither; -1: undecided, a mover that hardly moved, or unannotated.
 
     Args:
-        members: (H, P) source points that every hypothesis moves.
+        members: (H, P) source points moved by every hypothesis.
         body: (P,) true cluster of every point, -1 none, `IGNORED`. motions: (K+1, 3) of every cluster, NaN where unknown.
     """
     leftover, found = survey.leftover, survey.hypotheses.motions
@@ -176,8 +176,8 @@ def label_hypotheses(survey: Survey, members: Bools, body: Ints, motions: Floats
     pure = of_body.max(-1) / count
     error = _apart(found, motions[which], points, members)
     travel = _apart(np.broadcast_to(motions[0], found.shape), motions[which], points, members)
-    local = (members * leftover.source.units).sum(-1) / count  # far away, points tell less
-    with np.errstate(invalid="ignore"):  # NaN where a motion is unknown: no comparison with it holds
+    local = (members * leftover.source.units).sum(-1) / count  # distant points carry less information
+    with np.errstate(invalid="ignore"):  # NaN for unknown motions: all comparisons are False
         tolerance = np.maximum(TOLERANCE * np.maximum(local, unit), TOLERANCE_SHARE * travel)
         right = (pure >= PURE) & (which > 0) & (travel > unit) & (error < tolerance)
         between = (pure >= 0.5) & (which > 0) & (error < 1.5 * tolerance) & (travel > 0.5 * unit)
@@ -186,23 +186,23 @@ def label_hypotheses(survey: Survey, members: Bools, body: Ints, motions: Floats
 
 
 def _apart(one: Floats, other: Floats, points: Floats, members: Bools) -> Floats:
-    """(H,) mean distance of the members carried by two motions (H, 3) each."""
+    """(H,) mean distance of the members under two motions (H, 3) each."""
     here, there = (se2.apply(torch.tensor(motions), torch.from_numpy(points)).numpy() for motions in (one, other))  # (H, P, 2)
     gap = np.linalg.norm(here - there, axis=-1)
     return np.where(members, gap, 0.0).sum(-1) / members.sum(-1)
 
 
 def _best_threshold(score: HypothesisScore, views: Sequence[HypothesisView]) -> float:
-    """The probability at which accepted movers have the best F score: false ones cost more than missed ones."""
+    """The probability threshold with the best F score of accepted movers, where false ones cost more than missed ones."""
     results = np.array([_count_accepted(score, view) for view in views]).sum(0)  # (T, 3)
     right, accepted, true = results.T
     return THRESHOLDS[int(((1 + FALSE_COST) * right / np.maximum(FALSE_COST * accepted + true, 1)).argmax())]
 
 
 def _count_accepted(score: HypothesisScore, view: HypothesisView) -> list[tuple[int, int, int]]:
-    """For every threshold: right acceptances (each mover once), acceptances, and movers that some hypothesis got right.
+    """For every threshold: right acceptances (each mover once), acceptances, and movers with a right hypothesis.
 
-    The choice is greedy, so a higher threshold accepts the first of those that a lower one accepts.
+    The choice is greedy, so a higher threshold accepts a prefix of those accepted at a lower one.
     """
     survey = view.survey
     findable = len(_bodies(view, np.flatnonzero(view.label == 1)))
@@ -217,6 +217,6 @@ def _count_accepted(score: HypothesisScore, view: HypothesisView) -> list[tuple[
 
 
 def _bodies(view: HypothesisView, which: Ints) -> set[int]:
-    """The movers that most members of each of the hypotheses (G,) belong to."""
+    """The movers to which most members of each of the hypotheses (G,) belong."""
     values = (np.unique(view.body[row], return_counts=True) for row in view.members(which))
     return {int(bodies[counts.argmax()]) for bodies, counts in values}

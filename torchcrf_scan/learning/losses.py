@@ -1,6 +1,6 @@
-"""The losses that learning descends, by name, and what each can do: one line each.
+"""Register of the losses of learning with their abilities, one line each.
 
-A new loss is a function of the run's settings that makes an `objectives.Objective`, and a line here.
+A new loss is a function that makes an `objectives.Objective` from the run's settings, and a line here.
 """
 
 from __future__ import annotations
@@ -8,20 +8,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-NO_STEPS = "none"  # the staged fit is all
-STAGED = "pseudo_likelihood"  # what the staged fit descends first
+NO_STEPS = "none"  # staged fit only
+STAGED = "pseudo_likelihood"  # the staged fit's first objective
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loss:
-    """What a loss can do.
+    """Abilities of a loss.
 
     Attributes:
         function: `module:name` within the package, `function(config)` makes the objective of first-order steps.
-        is_staged: the staged fit knows it; otherwise first-order steps follow the fit of `STAGED`.
-        is_exact: the staged fit goes on with the exact likelihood of each chain.
-        needs_start: it looks at the pairs under InitialiseRT's motions.
-        has_temperature: of its own, at which beliefs are read out (`UnrolledConfig`).
+        is_staged: supported by the staged fit; otherwise first-order steps follow the staged fit with `STAGED`.
+        is_exact: the staged fit continues with the exact likelihood of each chain.
+        needs_start: it uses the motions of InitialiseRT.
+        has_temperature: it has its own temperature of the read-out (`UnrolledConfig`).
     """
 
     function: str

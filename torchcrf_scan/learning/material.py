@@ -1,4 +1,4 @@
-"""Annotated pairs as learning sees them: looked at once, then dealt out to as many folds and models as one likes."""
+"""Annotated pairs prepared for learning: surveyed once, then reused by any number of folds and models."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from torchcrf_scan.search.pairs import choose, survey
 from torchcrf_scan.search.score import HypothesisScore
 from torchcrf_scan.search.survey import Survey
 
-PART = 4  # pairs that one job looks at
+PART = 4  # pairs per job
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """A batch of annotated pairs with its start; `fold` is its part of the out-of-fold margins, `pairs` are undisturbed."""
+    """A batch of annotated pairs with its start; `fold` is its fold for out-of-fold margins, `pairs` are undisturbed."""
 
     batch: ScanPairBatch
     start: Start
@@ -35,12 +35,12 @@ class Material:
 
 @dataclass(frozen=True, slots=True)
 class Collection:
-    """Annotated pairs with all that takes long to find and depends neither on other pairs nor on anything learned.
+    """Annotated pairs with expensive results that depend neither on other pairs nor on learned parameters.
 
     Attributes:
-        pairs: all P pairs as they are. batch: the same, disturbed as moving sensors disturb them.
-        surveys: P what InitialiseRT looks at in the disturbed pairs.
-        views: P lists of what the movers' score is fitted on.
+        pairs: all P pairs, undisturbed. batch: the same, disturbed as by moving sensors.
+        surveys: P results of the search of InitialiseRT in the disturbed pairs.
+        views: P lists of examples for the movers' score.
     """
 
     pairs: tuple[ScanPair, ...]
@@ -53,12 +53,12 @@ class Collection:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of every pair."""
+        """Names of the pairs."""
         return tuple(pair.name for pair in self.pairs)
 
     @property
     def sequences(self) -> tuple[str, ...]:
-        """Of every pair."""
+        """Sequences of the pairs."""
         return tuple(pair.sequence for pair in self.pairs)
 
     def fit_score(self, index: Iterable[int]) -> HypothesisScore:
@@ -66,7 +66,7 @@ class Collection:
         return fit_hypothesis_score([view for k in index for view in self.views[k]])
 
     def material(self, index: Sequence[int], score: HypothesisScore, clusters: int, config: LearningConfig) -> list[Material]:
-        """Batches of some of the pairs, each of one out-of-fold part, with the start that the score gives.
+        """Batches of some of the pairs, each within one fold, with the start selected by the score.
 
         clusters: C, background included.
         """
@@ -83,7 +83,7 @@ class Collection:
 
 
 def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) -> Collection:
-    """Looks at the pairs, on `jobs` cores (-1: all); what is drawn at random for a pair does not depend on `jobs`.
+    """Surveys the pairs on `jobs` cores (-1: all); random draws for a pair do not depend on `jobs`.
 
     Raises:
         ValueError: a pair without annotation, or no pair.
@@ -115,7 +115,7 @@ def _look(
 
 
 def assign_folds(sequences: Sequence[str], folds: int) -> list[int]:
-    """A fold for every pair, given its sequence; sequences stay whole and are dealt out by size, one fold where there is one."""
+    """A fold for every pair, given its sequence; sequences stay whole and are distributed by size; a single one gives one fold."""
     sizes: dict[str, int] = {}
     for sequence in sequences:
         sizes[sequence] = sizes.get(sequence, 0) + 1

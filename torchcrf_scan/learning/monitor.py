@@ -1,4 +1,4 @@
-"""What first-order training shows in TensorBoard while it runs: scalars by group, histograms, figures, the graph, the settings."""
+"""TensorBoard events of first-order training: scalars by group, histograms, figures, the graph, the settings."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ GROUPS = {
         "found_mover_centroid_median",
     ),
     "calibration": ("association_ece", "cluster_ece", "nees_covered", "nees_mean"),
-}  # of the figures of `summarise`, those worth a curve
+}  # figures of `summarise` that are drawn as curves
 LAYOUT = {
     "loss": {"training and validation": ["Multiline", ["loss/total", "validation/total"]]},
     **{
@@ -58,7 +58,7 @@ DATA, OUTLIER = len(LOCAL_CHANNELS), len(LOCAL_CHANNELS) + 1  # columns of the b
 
 
 def while_it_can_write(show: Callable[Concatenate[TrainingMonitor, P], None]) -> Callable[Concatenate[TrainingMonitor, P], None]:
-    """A method that says so where the disk is full, and from then on does nothing: training goes on without being watched."""
+    """Wraps a method so that a full disk is logged and ends the monitoring, but not the training."""
 
     @wraps(show)
     def guarded(monitor: TrainingMonitor, /, *args: P.args, **kwargs: P.kwargs) -> None:
@@ -77,7 +77,7 @@ class TrainingMonitor:
 
     Args:
         folder: the run folder. config: of the run.
-        first_step: of a run that goes on; what a broken-off one wrote from there on is hidden. None: all that is there is hidden.
+        first_step: of a resumed run; older events from this step on are hidden. None: all older events are hidden.
     """
 
     def __init__(self, folder: Path, config: Config, first_step: int | None = None) -> None:
@@ -96,7 +96,7 @@ class TrainingMonitor:
 
     @while_it_can_write
     def close(self) -> None:
-        """Writes what is left."""
+        """Flushes the remaining events."""
         self.writer.close()
 
     @while_it_can_write
@@ -112,14 +112,14 @@ class TrainingMonitor:
 
     @property
     def temperature(self) -> float:
-        """Of the read-out that the loss looks at."""
+        """Temperature at which the loss reads out beliefs."""
         config = self.config
         is_own = config.has_steps and LOSSES[config.first_order].has_temperature
         return config.unrolled.temperature if is_own else config.model.inference.temperature
 
     @while_it_can_write
     def validated(self, step: int, model: JointScanCRF, losses: Mapping[str, float], answers: Answers) -> None:
-        """Losses, figures of merit beside the baselines', histograms and pictures of one look at the validation pairs."""
+        """Losses, metrics beside those of the baselines, histograms and pictures of one validation."""
         self._scalars({f"validation/{name}": value for name, value in losses.items()}, step)
         for method, predictions in answers.predictions.items():
             found = summarise([score_pair(pair, answer) for pair, answer in zip(answers.pairs, predictions, strict=True)])
@@ -136,7 +136,7 @@ class TrainingMonitor:
 
     @while_it_can_write
     def finished(self, settings: Mapping[str, Any], metrics: Mapping[str, float], step: int) -> None:
-        """The settings of the run beside what came of them, for TensorBoard's `hparams`."""
+        """The settings of the run with its final metrics, for TensorBoard's `hparams`."""
         write_settings(self.writer, settings, metrics, step)
 
     def _scalars(self, values: Mapping[str, float], step: int) -> None:
@@ -167,7 +167,7 @@ class TrainingMonitor:
 
 
 def moving_points(answers: Answers) -> tuple[np.ndarray, np.ndarray]:
-    """(P,) how sure every return moves and (P,) whether it does, over those whose body somebody annotated."""
+    """(P,) probability of moving of every return and (P,) whether it moves, for returns with an annotated body."""
     scores, truths = [], []
     for pair, score in zip(answers.pairs, answers.moving, strict=True):
         assert pair.annotation is not None
@@ -180,14 +180,14 @@ def moving_points(answers: Answers) -> tuple[np.ndarray, np.ndarray]:
 
 
 def named_weights(model: JointScanCRF) -> dict[str, float]:
-    """Every learned number of the model that has a name of its own, as `association/NAME` or `clustering/NAME`."""
+    """Every learned scalar with a name, as `association/NAME` or `clustering/NAME`."""
     chains = {"association": model.association_weights, "clustering": model.clustering_weights}
     return {f"{chain}/{name}": float(weight.detach()) for chain, weights in chains.items() for name, weight in weights.items()}
 
 
 @torch.no_grad()
 def boosted_margins(model: JointScanCRF, batch: ScanPairBatch) -> dict[str, Tensor]:
-    """(P,) margins by name: of true pairs of points, of wrong ones, and of points that are outliers or not; at the true motions."""
+    """(P,) margins by name: of true and wrong pairs of points, and of inliers and outliers; at the true motions."""
     if not model.config.has_association:
         return {}
     view = model.view(batch)
@@ -206,9 +206,9 @@ def boosted_margins(model: JointScanCRF, batch: ScanPairBatch) -> dict[str, Tens
 
 @torch.no_grad()
 def belief_changes(model: JointScanCRF, batch: ScanPairBatch, start: Start) -> dict[str, Tensor]:
-    """(P,) by round, how far every point's beliefs in its clusters moved in it, at most: the residual of the messages.
+    """(P,) by round, the largest change of every point's cluster beliefs: the residual of the messages.
 
-    Messages on a chain are exact, so what is left to settle is between the rounds.
+    Messages on a chain are exact, so convergence is a matter of the rounds only.
     """
     if not SCHEDULES[model.config.inference.schedule].takes_couplings:
         return {}

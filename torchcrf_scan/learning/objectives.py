@@ -1,4 +1,4 @@
-"""The losses of first-order training: from a model and a portion of pairs to named terms, of which `total` is descended."""
+"""Losses of first-order training: from a model and a portion of pairs to named terms, of which `total` is minimised."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ Objective = Callable[[JointScanCRF, Portion], dict[str, Tensor]]
 
 
 def known_nodes(batch: ScanPairBatch) -> Tensor:
-    """() real points that somebody annotated: what the terms of a batch are means over, and so its weight among others."""
+    """() number of annotated points: the terms of a batch are means over these, so it is the weight of the batch."""
     assert batch.truth is not None
     return (batch.truth.known & batch.source_mask).sum()
 
 
 def pseudo_likelihood(model: JointScanCRF, portion: Portion) -> dict[str, Tensor]:
-    """Negative log pseudo-likelihood per known node."""
+    """Negative log pseudo-likelihood per annotated node."""
     loss = -model.pseudo_log_likelihood(portion.batch).sum() / known_nodes(portion.batch).clamp(min=1)
     return {"total": loss}
 
 
 def likelihood(model: JointScanCRF, portion: Portion, config: LearningConfig) -> dict[str, Tensor]:
-    """Negative log of the exact likelihood of each chain per known node (spec 6.5), `association` and `cluster`, or `lattice`.
+    """Negative log of the exact likelihood of each chain per annotated node (spec 6.5), `association` and `cluster`, or `lattice`.
 
-    At the motions of the start where they are right and the portion was surveyed, else at the true ones. Costs a recursion over the
-    points forward and one back; memory N K^2 transitions of every feature.
+    At the motions of the start where they are right and the portion was surveyed, else at the true ones. Costs a forward and a
+    backward recursion over the points; memory N K^2 transitions of every feature.
     """
     nodes = known_nodes(portion.batch).clamp(min=1)
     terms: dict[str, Tensor] = {}
@@ -57,7 +57,7 @@ def labelled_chains(
 ) -> Iterator[tuple[str, features.Chain | LatticeChain, Tensor]]:
     """The model's chains at the true labels, each with its name and weights.
 
-    The clustering chain beside another is told the model's own associations in `config.predicted_share` of surveyed pairs (A-28).
+    In joint models the clustering chain sees the model's own associations in `config.predicted_share` of surveyed pairs (A-28).
     """
     batch, fitted, inference = portion.batch, model.fitted, model.config.inference
     learned = fitted.scales, fitted.boosters, inference
@@ -85,14 +85,14 @@ def labelled_chains(
 
 
 def start_of(model: JointScanCRF, portion: Portion) -> Start:
-    """The motions to begin with, from what was surveyed, or looked for now."""
+    """The initial motions, from the surveys if there are any, else from InitialiseRT."""
     if not portion.surveys:
         return model.initialise(portion.batch)
     return choose(portion.batch, portion.surveys, score_of(model.hypothesis_score), model.config.motions)
 
 
 def make_objective(config: Config) -> Objective:
-    """The loss that `config.first_order` names."""
+    """The loss named by `config.first_order`."""
     objective: Objective = load(LOSSES[config.first_order].function)(config)
     return objective
 
@@ -103,5 +103,5 @@ def make_pseudo_likelihood(config: Config) -> Objective:
 
 
 def make_likelihood(config: Config) -> Objective:
-    """`likelihood` with plug-ins as `config.learning` says."""
+    """`likelihood` with plug-ins according to `config.learning`."""
     return partial(likelihood, config=config.learning)

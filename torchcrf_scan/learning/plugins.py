@@ -1,4 +1,4 @@
-"""What the features take as observed while they are learned: motions and labels as good as those met in use (A-11, A-28)."""
+"""Plug-ins of learning: motions and labels treated as observed, as accurate as those met in use (A-11, A-28)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchcrf_scan.learning.settings import LearningConfig
 def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig, generator: torch.Generator) -> PlugIns:
     """True motions with noise for some pairs, InitialiseRT's for the others; spare slots hold its spurious movers (spec 2.5, 6.2).
 
-    A found motion stands for a true one when it moves that cluster's points nearly alike. Labels are the truth's.
+    A found motion replaces a true one if it moves that cluster's points nearly alike. Labels are the annotated ones.
     """
     truth = true_plugins(batch, start.motions.shape[1])
     noise = torch.randn(truth.motions.shape, generator=generator, dtype=torch.float64).to(truth.motions)
@@ -33,7 +33,7 @@ def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig,
 
 
 def match_start(batch: ScanPairBatch, start: Start, truth: PlugIns) -> Tensor:
-    """(B, C, C') whether found motion k' stands for true cluster k: at most one each, within a quarter metre or of the travel."""
+    """(B, C, C') whether found motion k' matches true cluster k: at most one each, within a quarter metre or of the travel."""
     clusters = torch.arange(truth.motions.shape[1], device=truth.label.device)
     members = (truth.label[:, None] == clusters[:, None]).to(batch.source)  # (B, C, N)
     share = members / members.sum(-1, keepdim=True).clamp(min=1)
@@ -50,9 +50,9 @@ def match_start(batch: ScanPairBatch, start: Start, truth: PlugIns) -> Tensor:
 
 
 def fill_spare_slots(plugins: PlugIns, batch: ScanPairBatch, start: Start, stands_for: Tensor) -> PlugIns:
-    """Puts found movers that stand for nothing into empty slots, so that the weights learn to ignore them."""
+    """Fills empty slots with unmatched found movers, so that the weights learn to ignore such."""
     spurious = start.active & ~stands_for.any(1)
-    spurious[:, 0] = False  # a wrong background is no mover
+    spurious[:, 0] = False  # a wrong background is not a mover
     motions, active = plugins.motions.clone(), plugins.active.clone()
     reach = reach_of_truth(plugins, batch)
     for b in range(len(motions)):
@@ -65,7 +65,7 @@ def fill_spare_slots(plugins: PlugIns, batch: ScanPairBatch, start: Start, stand
 
 
 def reach_of_truth(plugins: PlugIns, batch: ScanPairBatch) -> Tensor:
-    """(B, N, C) points near enough to the true points of every cluster."""
+    """(B, N, C) points within reach of the true points of every cluster."""
     clusters = torch.arange(plugins.motions.shape[1], device=plugins.label.device)
     return within_reach(batch.source, plugins.label[:, None] == clusters[:, None], resolution(batch))
 

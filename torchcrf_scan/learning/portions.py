@@ -25,7 +25,7 @@ class Portion:
     """A batch to learn from.
 
     Attributes:
-        surveys: what InitialiseRT looks at in its pairs, none where nobody needs it. seed: of what is drawn beside it.
+        surveys: of InitialiseRT in its pairs, empty if not needed. seed: of further random draws.
     """
 
     batch: ScanPairBatch
@@ -33,16 +33,16 @@ class Portion:
     seed: int = 0
 
     def to(self, device: torch.device) -> Portion:
-        """The batch on another device. Surveys stay, they are looked at where they were made."""
+        """The batch on another device. Surveys stay on the CPU."""
         return self if device.type == "cpu" else replace(self, batch=self.batch.to(device))
 
 
 @dataclass(frozen=True)
 class Collate:
-    """Makes a batch of samples, in the worker: frames displaced, scans disturbed, surveyed where the loss needs a start.
+    """Makes a batch of samples in the worker: displaces frames, disturbs scans, and surveys them if the loss needs a start.
 
     Attributes:
-        disturbance: see `learning.disturbance`. seed: of all that is drawn. surveys: whether to look for motions.
+        disturbance: see `learning.disturbance`. seed: of all random draws. surveys: whether to run the search for motions.
     """
 
     disturbance: float = 0.0
@@ -50,7 +50,7 @@ class Collate:
     surveys: bool = False
 
     def __call__(self, samples: Sequence[Sample]) -> Portion:
-        """The portion of the samples, of which the first one's index decides how they are disturbed."""
+        """The portion of the samples; the index of the first one seeds the disturbance."""
         batch = ScanPairBatch.collate([sample.pair for sample in samples])
         offset = torch.from_numpy(np.stack([sample.offset for sample in samples])).to(batch.source)
         batch = batch.displaced(offset) if bool(offset.any()) else batch
@@ -62,7 +62,7 @@ class Collate:
 
 
 def load_portions(stream: PairStream, parts: Parts, collate: Collate, workers: int) -> Iterator[Portion]:
-    """The parts in their order, generated ahead by `workers` processes, or here where there are none."""
+    """The parts in their order, generated ahead by `workers` processes, or in this one for 0."""
     if not workers:
         return (collate([stream[k] for k in part]) for part in parts)
     loader: DataLoader[Portion] = DataLoader(
@@ -70,29 +70,29 @@ def load_portions(stream: PairStream, parts: Parts, collate: Collate, workers: i
         batch_sampler=parts,
         collate_fn=collate,
         num_workers=workers,
-        multiprocessing_context="spawn",  # a fork takes over the locks of threads that it does not have
+        multiprocessing_context="spawn",  # a fork would copy locks held by threads that do not exist in it
         worker_init_fn=calm_worker,
     )
     return iter(loader)
 
 
 def calm_worker(worker: int) -> None:
-    """One thread a worker; its random state decides nothing, since every sample brings its own. It ends with its parent.
+    """Limits a worker to one thread; its random state has no effect, as every sample is seeded. It ends with its parent.
 
-    A worker whose parent was killed would wait for ever for somebody to take what it has made.
+    Otherwise a worker whose parent was killed would wait for ever for its results to be fetched.
     """
     torch.set_num_threads(1)
     threading.Thread(target=leave_with, args=(os.getppid(),), daemon=True).start()
 
 
 def leave_with(parent: int) -> None:
-    """Ends this process, at once and whatever it does, when its parent has gone."""
+    """Ends this process immediately once its parent has ended."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)
 
 
 def as_portion(pairs: Sequence[ScanPair]) -> Portion:
-    """Pairs as they are, surveyed."""
+    """A portion of undisturbed pairs, surveyed."""
     batch = ScanPairBatch.collate(pairs)
     return Portion(batch, tuple(survey(batch)))

@@ -1,4 +1,4 @@
-"""The processes of one training run: alone, or those that `torchrun` started, on one machine or many."""
+"""The processes of one training run: a single one, or those started by `torchrun`, on one machine or several."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from torch import Tensor, distributed, nn
 
 T = TypeVar("T")
 CPU = torch.device("cpu")
-PATIENCE = timedelta(hours=24)  # the others wait for the first one's staged fit
+PATIENCE = timedelta(hours=24)  # the others wait for the staged fit of the first one
 
 
 @dataclass(frozen=True, slots=True)
 class Ranks:
-    """This process among all; `device` is where it calculates. Alone, nothing is sent anywhere."""
+    """This process among all, and its `device`. A single process does not communicate."""
 
     rank: int = 0
     world: int = 1
@@ -27,7 +27,7 @@ class Ranks:
 
     @property
     def is_first(self) -> bool:
-        """Whether it is the one that writes."""
+        """Whether this process is the one that writes."""
         return self.rank == 0
 
     def sum(self, values: Tensor) -> Tensor:
@@ -45,7 +45,7 @@ class Ranks:
         return cast(list[T], everyone)
 
     def share(self, value: T) -> T:
-        """The first process's object, in all of them."""
+        """The first process's object, in all processes."""
         if self.world == 1:
             return value
         box = [value]
@@ -53,7 +53,7 @@ class Ranks:
         return box[0]
 
     def share_weights(self, module: nn.Module) -> None:
-        """Gives every process the first one's parameters and buffers."""
+        """Copies the first process's parameters and buffers to every process."""
         state = {name: value.cpu() for name, value in module.state_dict().items()}
         module.load_state_dict(self.share(state))
 
@@ -63,12 +63,12 @@ ALONE = Ranks()
 
 @contextmanager
 def join(device: str = "auto", environment: Mapping[str, str] = os.environ) -> Iterator[Ranks]:
-    """Joins the processes that `torchrun` started, if it did, and leaves them in the end; nccl on GPUs, gloo on CPUs.
+    """Joins the processes started by `torchrun`, if any, and leaves them at the end; nccl on GPUs, gloo on CPUs.
 
     device: `auto`, `cpu` or `cuda`.
 
     Raises:
-        ValueError: `cuda` where there is none.
+        ValueError: `cuda` on a machine without.
     """
     has_gpu = torch.cuda.is_available()
     if device == "cuda" and not has_gpu:

@@ -1,4 +1,4 @@
-"""What a run shows in TensorBoard, and its pictures on disk."""
+"""TensorBoard events of a run, and its pictures on disk."""
 
 from __future__ import annotations
 
@@ -44,23 +44,23 @@ class RunLog:
             self.writer.add_scalar(f"weights/{tag}/{name}", value, step)
 
     def metrics(self, method: str, summary: dict[str, float], step: int = 0) -> None:
-        """Every number of a summary that is one."""
+        """Every finite number of a summary."""
         for name, value in summary.items():
             if np.isfinite(value):
                 self.writer.add_scalar(f"test/{name}/{method}", value, step)
 
     def settings(self, settings: Mapping[str, Any], summary: Mapping[str, float]) -> None:
-        """The settings of the run beside what came of them."""
+        """The settings of the run with its results."""
         write_settings(self.writer, settings, summary)
 
     def picture(self, pair: ScanPair, prediction: PairPrediction, step: int = 0) -> None:
-        """The pair with its prediction beside the truth: an event and a PNG."""
+        """The pair with its prediction and the truth side by side: an event and a PNG."""
         figure = plot_pair(pair, prediction)
         save_figure(figure, self.folder / "pictures" / f"{step:02d}_{pair.name}.png")
         self.figure("pair", figure, step)
 
     def figure(self, tag: str, figure: Figure, step: int = 0) -> None:
-        """A figure as an event, without a PNG; it stays open."""
+        """A figure as an event, without a PNG; it is not closed."""
         self.writer.add_figure(tag, figure, step, close=False)
 
     def table(self, table: Table, step: int = 0) -> None:
@@ -69,7 +69,7 @@ class RunLog:
 
 
 def write_settings(writer: SummaryWriter, settings: Mapping[str, Any], metrics: Mapping[str, float], step: int = 0) -> None:
-    """For TensorBoard's `hparams`: settings by their full names, and as `final/NAME` what came of them, where it is a number."""
+    """For TensorBoard's `hparams`: settings by their full names, and finite metrics as `final/NAME`."""
     allowed = {name: value if isinstance(value, bool | int | float | str) else str(value) for name, value in settings.items()}
     final = {f"final/{name}": float(value) for name, value in metrics.items() if np.isfinite(value)}
     events = writer.file_writer

@@ -23,16 +23,16 @@ WORST_SHARE = 0.1
 
 
 def robust_scale(errors: Tensor, floor: float) -> Tensor:
-    """1.4826 median |error|, at least `floor`; `floor` for no errors. errors: (P,)."""
+    """1.4826 median |error|, at least `floor`; `floor` for empty input. errors: (P,)."""
     if len(errors) == 0:
         return errors.new_tensor(floor)
     return (1.4826 * errors.abs().median()).clamp(min=floor)
 
 
 def fit_scales(views: Sequence[PairView], plugins: Sequence[PlugIns]) -> Scales:
-    """Robust scales of every error over the true pairs, then what the worst tenth of the true pairs gets as the outlier's constant.
+    """Robust scales of every error over the true pairs, then the features' values at the outlier state (their worst tenth).
 
-    Works in float64; raises ValueError where no pair has an association.
+    Works in float64; raises ValueError if no pair has an association.
     """
     parts = [true_errors(view, plug) for view, plug in zip(views, plugins, strict=True)]
     errors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
@@ -53,9 +53,9 @@ def fit_scales(views: Sequence[PairView], plugins: Sequence[PlugIns]) -> Scales:
 
 
 def fit_gate(matched: Tensor, unmatched: Tensor) -> Tensor:
-    """() the distance that parts true pairs (P,) from outliers (Q,), their nearest point's distance, with the fewest errors."""
+    """() the distance that separates true pairs (P,) from the nearest points of outliers (Q,) with the fewest errors."""
     gates = torch.cat([matched, unmatched, matched.new_zeros(1)]).clamp(min=CLUSTER_FLOOR).unique()  # ascending
-    right, wrong = (torch.searchsorted(of.sort().values, gates, right=True) for of in (matched, unmatched))  # let through
+    right, wrong = (torch.searchsorted(of.sort().values, gates, right=True) for of in (matched, unmatched))  # number accepted
     return gates[(right - wrong).argmax()]
 
 

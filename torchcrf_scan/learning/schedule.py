@@ -1,4 +1,4 @@
-"""When to learn how fast, and when to stop."""
+"""Learning-rate schedule and early stopping."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def make_schedule(optimiser: Optimizer, config: GradientConfig) -> LambdaLR:
 
 @dataclass(slots=True)
 class EarlyStopping:
-    """Which look at the validation pairs was the best, and for how many looks none has been better.
+    """Early stopping by the validation loss.
 
     Attributes:
-        patience: looks without a better one that end the training; 0: it never ends early.
-        best: least loss so far, `step` where it was. stale: looks since then.
+        patience: validations without improvement after which training ends; 0: never.
+        best: least loss so far, `step` at which it occurred. stale: validations since then.
     """
 
     patience: int
@@ -52,9 +52,9 @@ class EarlyStopping:
         return 0 < self.patience <= self.stale
 
     def state_dict(self) -> dict[str, float]:
-        """What changes."""
+        """The variable state."""
         return {"best": self.best, "step": self.step, "stale": self.stale}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Goes on from a state."""
+        """Restores a state."""
         self.best, self.step, self.stale = state["best"], int(state["step"]), int(state["stale"])

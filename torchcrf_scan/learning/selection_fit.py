@@ -1,4 +1,4 @@
-"""Fits what a mover's cluster is worth (`inference.selection`) by logistic regression on annotated pairs."""
+"""Fits the potential of a mover's cluster (`inference.selection`) by logistic regression on annotated pairs."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from torchcrf_scan.inference.state import ClusterPotential
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.model import JointScanCRF
 
-PURE = 0.5  # share of its points that a right cluster has from one true mover
-REGULARISATION = 1.0  # inverse
+PURE = 0.5  # least share of one true mover's points in a right cluster
+REGULARISATION = 1.0  # inverse strength
 
 
 @torch.no_grad()
 def fit_potential(model: JointScanCRF, material: Sequence[Material]) -> ClusterPotential:
-    """The worth by which the movers considered in the material are told best from those that are none.
+    """The potential that best separates true from false movers among those considered in the material.
 
     Returns:
-        The fitted potential, or the default one where the material holds no mover, or nothing else.
+        The fitted potential; the default one unless the material holds both true and false movers.
     """
     from sklearn.linear_model import LogisticRegression
 
@@ -41,7 +41,7 @@ def fit_potential(model: JointScanCRF, material: Sequence[Material]) -> ClusterP
 
 
 def judge_clusters(model: JointScanCRF, part: Material) -> tuple[Tensor, Tensor]:
-    """The potential's terms (P, 2) of all movers considered in a batch, and (P,) 1 where the cluster is a true mover's."""
+    """The potential's terms (P, 2) of all movers considered in a batch, and (P,) 1 if the cluster is a true mover's, else 0."""
     view = model.view(part.batch, model.learned_inputs(part.batch, part.start))
     start = part.start.scaled(view.factor).considered()
     parameters, config = model.fitted, model.config.inference
@@ -56,7 +56,7 @@ def judge_clusters(model: JointScanCRF, part: Material) -> tuple[Tensor, Tensor]
 
 
 def is_true_mover(view: PairView, start: Start, cluster: Tensor) -> Tensor:
-    """(B, C) whether most of a cluster's points are one true mover's, and no other cluster has more of it. cluster: (B, N)."""
+    """(B, C) whether most of a cluster's points belong to one true mover of which no other cluster has more. cluster: (B, N)."""
     truth = view.batch.truth
     assert truth is not None
     own = torch.nn.functional.one_hot(cluster.clamp(min=0), start.motions.shape[1]) * (cluster >= 0)[..., None]  # (B, N, C)

@@ -1,4 +1,4 @@
-"""Settings of learning: from which pairs, by which losses, how fast."""
+"""Settings of learning: data, losses, optimisation."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class UnrolledConfig:
     """The objective `unrolled`: losses on soft read-outs after a fixed number of rounds, at inferred motions.
 
     Attributes:
-        iterations: rounds, always all of them.
+        iterations: number of rounds, without early stopping.
         temperature: of the read-out: log-beliefs (max-marginals, where `inference.temperature` is 0) are divided by it.
         association: weight of the associations' cross-entropy.
         cluster: weight of the clusters' cross-entropy.
         rotation: weight of the motions' robust geodesic loss.
-        translation: weight of the motions' robust loss of where a cluster's centroid lands.
-        rotation_scale: radians; smaller errors count squared, larger ones by their logarithm.
-        translation_scale: metres (in the unit `spacing`, those of a street scanner), likewise.
+        translation: weight of the robust loss of the position of a cluster's moved centroid.
+        rotation_scale: radians; the loss is quadratic for smaller errors and logarithmic for larger ones.
+        translation_scale: metres (scaled as by `length_unit: spacing`), likewise.
         detach_motion: no gradient passes through a motion into the features of the next pass.
-        deep_supervision: earlier rounds count too, each by this factor less than the next; 0: the last alone, 1: all alike.
+        deep_supervision: factor between the weights of a round and of the next; 0: the last round alone, 1: all rounds equally.
     """
 
     iterations: Annotated[int, Within(1, 1000)] = 4
@@ -50,27 +50,27 @@ class UnrolledConfig:
 
 @dataclass(frozen=True)
 class LearningConfig:
-    """How the model is learned (spec 2, 6).
+    """Settings of the staged fit (spec 2, 6).
 
     Attributes:
         objective: `pseudo_likelihood` (the paper's), or `likelihood`: the exact likelihood of each chain, without the former's
-            over-strong pairwise weights (spec 6.5); or `unrolled`: from the weights of pseudo-likelihood on through the unrolled
-            iterations, step by step (`gradient`).
-        predicted_share: share of the pairs whose clustering features see predicted associations (A-28). 0, the true ones, for
-            pseudo-likelihood: given its neighbours' true clusters a point learns little else, and movers then fade; a half suits
-            `likelihood`. CRF-Clustering alone always sees predicted ones.
-        folds: parts of the training pairs for out-of-fold margins; sequences stay whole. 0: margins on the same pairs (faithful).
+            over-strong pairwise weights (spec 6.5); or `unrolled`: first-order steps through the unrolled iterations, starting
+            from the weights of pseudo-likelihood (`gradient`).
+        predicted_share: share of the pairs whose clustering features use predicted associations (A-28). 0, the true ones, for
+            pseudo-likelihood: given its neighbours' true clusters a point learns little else, and movers then vanish; 0.5 suits
+            `likelihood`. CRF-Clustering alone always uses predicted ones.
+        folds: folds of the training pairs for out-of-fold margins; sequences stay whole. 0: margins on the same pairs (faithful).
         negatives: wrong pairs per true one for the data booster.
-        booster_examples: examples that a booster sees at most, drawn at random; 0: all.
+        booster_examples: maximum number of examples of a booster, drawn at random; 0: all.
         prior: standard deviation s_w of the weights' Gaussian prior, on standardised features.
-        max_steps: L-BFGS steps at most.
+        max_steps: maximum number of L-BFGS steps.
         tolerance: gradient per node at which L-BFGS stops.
-        batch_size: pairs that are looked at at once.
+        batch_size: pairs processed at once.
         rotation_noise: radians of noise on the true motions.
         translation_noise: metres of noise on the true motions.
-        disturbance: units of resolution by which training scans are skewed and bumped, as moving sensors do; 0: as they are.
-        start_share: share of the pairs whose features see InitialiseRT's motions instead.
-        seed: of everything drawn while learning.
+        disturbance: units of resolution by which training scans are skewed and bumped, as by moving sensors; 0: undisturbed.
+        start_share: share of the pairs whose features use InitialiseRT's motions instead.
+        seed: of all random draws while learning.
     """
 
     objective: Annotated[str, OneOf(*LOSSES)] = STAGED
@@ -94,14 +94,14 @@ class LearningConfig:
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """How training pairs are varied as they are generated; 0 leaves a pair as it is.
+    """Augmentation of training pairs; 0 turns an augmentation off.
 
     Attributes:
         mirror: share of the pairs that are mirrored, left for right.
-        dropout: largest share of the returns of a scan that are lost.
-        noise: largest noise that is added to the returns, in units of the sensor's own.
-        frame_rotation: radians by which the target's frame is turned, at most.
-        frame_translation: how far the target's frame is moved along x and y, at most; in units of the usual range of the target.
+        dropout: largest share of the returns of a scan that are dropped.
+        noise: largest noise added to the returns, in units of the sensor's own.
+        frame_rotation: radians by which the target's frame is rotated, at most.
+        frame_translation: largest shift of the target's frame along x and y, in units of the usual range of the target.
     """
 
     mirror: Share = 0.5
@@ -115,37 +115,37 @@ class AugmentConfig:
 
     @classmethod
     def nothing(cls) -> AugmentConfig:
-        """Pairs stay as they are."""
+        """Settings without any augmentation."""
         return cls(mirror=0.0, dropout=0.0, noise=0.0, frame_rotation=0.0, frame_translation=0.0)
 
 
 @dataclass(frozen=True)
 class GradientConfig:
-    """First-order training, which goes on from the staged fit or from `init`: AdamW on pairs that are generated on the fly.
+    """First-order training from the weights of the staged fit or of `init`: AdamW on pairs that are generated on the fly.
 
     Attributes:
         objective: loss of the steps: `pseudo_likelihood`, `likelihood` (exact, of each chain at the start's motions) or
-            `unrolled`; `none`: no steps, the staged fit is all. With `learning.objective` unrolled it is `unrolled`.
-        steps: optimiser's steps at most.
+            `unrolled`; `none`: staged fit only. With `learning.objective` unrolled it is `unrolled`.
+        steps: maximum number of optimiser steps.
         batch_size: pairs of a step, of all processes together.
-        part: pairs that are looked at at once; a step's parts are shared out among the processes. Divides `batch_size`.
-        workers: processes that generate pairs, of every training process; 0: none beside it.
-        learning_rate: at its highest.
+        part: pairs processed at once; a step's parts are divided among the processes. Divides `batch_size`.
+        workers: processes that generate pairs, per training process; 0: generated in the training process.
+        learning_rate: maximum of the schedule.
         weight_decay: of AdamW.
-        warmup: steps until the learning rate is at its highest; after that it falls along a cosine.
-        final_rate: share of the highest learning rate that is left in the end.
-        clip: norm that gradients are cut to; 0: never.
-        amp: bfloat16 where the device is a GPU that has it (torch.autocast); a CPU always calculates in full precision.
-        device: `auto` (a GPU where there is one), `cpu` or `cuda`.
+        warmup: steps of linear increase to the maximal learning rate, which then decays along a cosine.
+        final_rate: final learning rate as a share of the maximum.
+        clip: norm to which gradients are clipped; 0: no clipping.
+        amp: bfloat16 on GPUs that support it (torch.autocast); CPUs always use full precision.
+        device: `auto` (a GPU if there is one), `cpu` or `cuda`.
         worlds: names of the simulated `WORLDS` that pairs are drawn from.
         fresh: share of the pairs that are simulated on the fly; the others are drawn from the training pairs.
-        validation: share of the training pairs, in whole sequences, that nothing is fitted on; 0: no validation, and the last
+        validation: share of the training pairs, in whole sequences, held out for validation; 0: no validation, and the last
             weights are kept instead of the best.
-        validate_every: steps between two looks at the validation pairs.
-        patience: looks without a better loss after which training stops early; 0: never.
-        checkpoint_every: steps between two checkpoints.
+        validate_every: steps between validations.
+        patience: validations without improvement after which training stops early; 0: never.
+        checkpoint_every: steps between checkpoints.
         graph: draw the module's graph in TensorBoard, which takes some seconds.
-        seed: of everything drawn: pair k of a run is a function of (seed, k) alone.
+        seed: of all random draws: pair k of a run is a function of (seed, k) alone.
     """
 
     objective: Annotated[str, OneOf(NO_STEPS, *LOSSES)] = NO_STEPS
@@ -180,7 +180,7 @@ class GradientConfig:
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Where annotated pairs come from: files, the simulator, or both.
+    """Sources of annotated pairs: files, the simulator, or both.
 
     Attributes:
         train: a file, folder or glob pattern of training pairs, or a list of them.
@@ -210,11 +210,11 @@ class Config:
     """One training run.
 
     Attributes:
-        output: run folder; resolved config, versions, model, metrics, events and pictures go there.
+        output: run folder for resolved config, versions, model, metrics, events and pictures.
         overfit: train and test on the first training pair alone, a quick check that everything can learn.
         compare_chains: also fit and evaluate CRF-Matching and CRF-Clustering alone.
-        init: a model, as a folder or by the name of a shipped one, whose weights first-order training begins with; none: it begins
-            with those of the staged fit.
+        init: a model, as a folder or by the name of a shipped one, with the initial weights of first-order training; none: those
+            of the staged fit.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -247,5 +247,5 @@ class Config:
 
     @property
     def staged(self) -> LearningConfig:
-        """How the staged fit learns: a loss that it does not know goes on from the fit of `STAGED`."""
+        """Settings of the staged fit; a loss that it does not support is replaced by `STAGED`."""
         return self.learning if LOSSES[self.learning.objective].is_staged else replace(self.learning, objective=STAGED)

@@ -1,7 +1,7 @@
-"""Training pairs without end, generated as they are asked for.
+"""An infinite stream of training pairs, generated on demand.
 
-Pair k is a function of (seed, k) alone: neither the number of worker processes nor of machines, nor where a run was broken off,
-has a say in it. So there are no seeds of workers to keep, and going on means to ask for the next k.
+Pair k is a function of (seed, k) alone and depends neither on the number of worker processes or machines nor on interruptions.
+So there are no seeds of workers to store, and a run is resumed from the next k.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ class Sample:
 
 
 def seed_of(*numbers: int) -> int:
-    """A seed in [0, 2^63) for a tuple of whole numbers of at least 0, as good as independent of all others."""
+    """A seed in [0, 2^63) from a tuple of non-negative integers, practically independent of the seeds of other tuples."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
 class PairStream(Dataset[Sample]):
-    """Pair k for every k: simulated, or drawn from given ones, then varied.
+    """Pair k for every k: simulated, or drawn from given ones, then augmented.
 
     Args:
         config: worlds, shares, augmentation and seed.
@@ -65,9 +65,9 @@ class PairStream(Dataset[Sample]):
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """The indices of every part that one process looks at, step after step from `first` to `last`.
+    """The sample indices of every part of this process, step after step from `first` to `last`.
 
-    A step has `batch_size` indices in a row and `batch_size / part` parts of them, dealt out to `world` processes in turn.
+    A step has `batch_size` consecutive indices in `batch_size / part` parts, distributed to `world` processes in turn.
     """
 
     batch_size: int

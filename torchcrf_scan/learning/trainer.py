@@ -1,4 +1,4 @@
-"""One training run: data, fit, evaluation, run folder. `train.py` is its entry."""
+"""One training run: data, fit, evaluation, run folder. Called by `train.py`."""
 
 from __future__ import annotations
 
@@ -49,17 +49,18 @@ from torchcrf_scan.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
-TEST_SEED = 10_000  # simulated test worlds start here, far from those of training
+TEST_SEED = 10_000  # first seed of simulated test worlds, far from those of training
 Decoder = Callable[[ScanPairBatch, Start], Prediction]
 
 
 def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]:
-    """Runs the whole of `config` and leaves the run folder behind. Returns every method's scores on the test pairs.
+    """Runs a training run and writes its run folder. Returns every method's scores on the test pairs.
 
     Under `torchrun` the first process does the staged fit and writes; all of them share the steps of first-order training and the
     test pairs.
 
-    resume: go on from the checkpoint in the run folder, where there is one; else begin anew.
+    Args:
+        resume: continue from the checkpoint in the run folder if there is one; else start anew.
     """
     with join(config.gradient.device if config.has_steps else "cpu") as ranks:
         return train_together(config, ranks, resume=resume)
@@ -68,7 +69,7 @@ def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]
 def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dict[str, list[PairScore]]:
     """This process's share of `train`."""
     if config.init:
-        find_weights(config.init)  # before anything is fitted
+        find_weights(config.init)  # fails early if there is no such model
     folder, resolved = Path(config.output), yaml.safe_dump(asdict(config), sort_keys=False)
     folder.mkdir(parents=True, exist_ok=True)
     train_pairs, test_pairs = load_data(config.data)
@@ -85,8 +86,8 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
     state = ranks.share(store.read() if resume and ranks.is_first else None)
     if ranks.is_first:
         if not resume:
-            store.path.unlink(missing_ok=True)  # of another run: this one must not go on from there
-        write_whole(folder / "config.yaml", resolved)  # not before a run with other settings has been refused
+            store.path.unlink(missing_ok=True)  # of an earlier run, which is not to be resumed
+        write_whole(folder / "config.yaml", resolved)  # after the check of the settings of a resumed run
     if resume:
         log.info("going on from step %d" if state else "no checkpoint yet, beginning anew", *([state["step"]] if state else []))
     with RunLog(folder) if ranks.is_first else nullcontext() as run:
@@ -125,7 +126,7 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
 
 
 def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], list[ScanPair]]:
-    """Training and validation pairs, sequences whole; all for training where there is no first-order training to stop early.
+    """Training and validation pairs, sequences whole; all for training without first-order training.
 
     Raises:
         ValueError: too few sequences to hold one out.
@@ -141,7 +142,7 @@ def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], lis
 def prepare(
     model: JointScanCRF, pairs: Sequence[ScanPair], config: Config, run: RunLog, state: dict[str, Any] | None
 ) -> list[Material]:
-    """Material from the pairs, and the model as training finds it: fitted in stages, from `config.init`, or from a checkpoint."""
+    """Material from the pairs, and the initial model of first-order training: staged fit, `config.init`, or a checkpoint."""
     collection = collect(pairs, config.learning, jobs=-1)
     everything = range(len(collection))
     if state is not None:
@@ -158,7 +159,7 @@ def prepare(
 
 
 def settings_of(config: Config) -> dict[str, str]:
-    """By name, the settings that a run which goes on must have in common with the one that was broken off."""
+    """Settings, by name, that must be equal when a run is resumed."""
     free = (
         "output",
         "compare_chains",
@@ -196,14 +197,14 @@ def load_data(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
 
 
 def refuse_leaks(train_pairs: Sequence[ScanPair], test_pairs: Sequence[ScanPair]) -> None:
-    """Raises ValueError where a sequence is on both sides: its pairs overlap in time."""
+    """Raises ValueError if a sequence is in both training and test: its pairs overlap in time."""
     both = sorted({pair.sequence for pair in train_pairs} & {pair.sequence for pair in test_pairs})
     if both:
         raise ValueError(f"data: expected no sequence in both training and test pairs, got {', '.join(both[:5])}")
 
 
 def fit_baselines(material: list[Material], config: Config, run: RunLog) -> Cascade | None:
-    """Fits each chain alone where asked for, from the same start."""
+    """Fits each chain alone if enabled, from the same start."""
     if not (config.compare_chains and config.model.has_association and config.model.has_clusters):
         return None
     learning = replace(config, learning=config.staged)
@@ -211,7 +212,7 @@ def fit_baselines(material: list[Material], config: Config, run: RunLog) -> Casc
 
 
 def decoders_of(model: JointScanCRF, cascade: Cascade | None) -> dict[str, Decoder]:
-    """What is evaluated: the model and, where it was fitted, each chain alone."""
+    """The methods to evaluate: the model and, if fitted, each chain alone."""
     decoders: dict[str, Decoder] = {"joint": model}
     if cascade is not None:
         matching = cascade.matching
@@ -236,9 +237,9 @@ def watches(run: RunLog, method: str) -> dict[str, Watch]:
 def evaluate(
     model: JointScanCRF, decoders: dict[str, Decoder], pairs: Sequence[ScanPair], batch_size: int, ranks: Ranks = ALONE
 ) -> tuple[dict[str, list[PairScore]], dict[str, list[PairPrediction]]]:
-    """Scores and answers of every method on the pairs, all from the start that `model` finds.
+    """Scores and predictions of every method on the pairs, all from the start found by `model`.
 
-    Batches are dealt out to the processes; each of them returns everything.
+    Batches are distributed to the processes; each of them returns everything.
     """
     found: dict[str, dict[int, PairPrediction]] = {method: {} for method in decoders}
     model.eval()
@@ -271,7 +272,7 @@ def pairs_to_draw(pairs: Sequence[ScanPair], most: int = 4) -> list[int]:
 
 
 def write_results(folder: Path, scores: dict[str, list[PairScore]], tables: Sequence[Table]) -> None:
-    """`metrics.json`, `tables.md`, `versions.json`; each whole or not at all."""
+    """Writes `metrics.json`, `tables.md` and `versions.json`, each atomically."""
     metrics = {method: summarise(of_method) for method, of_method in scores.items()}
     contents = {
         "metrics.json": json.dumps(metrics, indent=2) + "\n",
@@ -283,7 +284,7 @@ def write_results(folder: Path, scores: dict[str, list[PairScore]], tables: Sequ
 
 
 def versions() -> dict[str, str]:
-    """What the run was made with."""
+    """Versions of the packages used and of the code."""
     found = {name: version(name) for name in ("torchcrf-scan", "torch", "numpy", "scikit-learn", "scipy")}
     commit = subprocess.run(
         ["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False

@@ -1,12 +1,12 @@
-"""The objective `unrolled`: losses on soft read-outs after a fixed number of rounds, at the motions that were inferred.
+"""The objective `unrolled`: losses on soft read-outs after a fixed number of rounds, at the inferred motions.
 
     association, cluster   cross-entropy of the true labels under log-beliefs / temperature
-    rotation, translation  log(1 + (error / scale)^2) of every true cluster's motion: its angle, and where its centroid lands
+    rotation, translation  log(1 + (error / scale)^2) of every true cluster's motion: its angle, and its moved centroid
 
-Gradients pass through messages, the candidates' scores, the steps that fit motions (their weights are soft here) and the features
-at the new motions. What nothing can teach does not count: points that nobody annotated, true targets that are no candidate, true
-clusters that a point cannot have, and the points of true movers that no predicted cluster stands for. Predicted movers that stand
-for nothing count as wrong answers. No step depends on a tensor's value, so a batch with its start can be compiled or exported.
+Gradients pass through messages, the candidates' scores, the steps that fit motions (with soft weights here) and the features
+at the new motions. Labels that cannot be predicted are left out: unannotated points, true targets that are no candidate, true
+clusters that are impossible at a point, and the points of true movers unmatched by a predicted cluster. Unmatched predicted
+movers count as wrong labels. Control flow does not depend on tensor values, so a batch with its start can be compiled or exported.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from torchcrf_scan.learning.settings import Config, UnrolledConfig
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.variants import sweep
 
-LEAST_LIKENESS = 0.5  # of a predicted mover that stands for a true one: half of its points, or a motion just within the tolerance
-TRAVEL_SHARE, LEAST_GAP = 0.15, 0.05  # tolerance of that motion: a share of the mover's travel; metres, beside twice the noise
+LEAST_LIKENESS = 0.5  # least similarity of a match: half of the points, or a motion just within the tolerance
+TRAVEL_SHARE, LEAST_GAP = 0.15, 0.05  # tolerance of that motion: a share of the mover's travel; metres, on top of twice the noise
 
 
 @dataclass(frozen=True, slots=True)
 class Sum:
-    """A term before it is a mean, so that parts of a batch can be put together.
+    """The numerator and denominator of a mean, so that parts of a batch can be combined.
 
     Attributes:
-        total: () sum of losses. count: () of what was annotated, without gradient.
+        total: () sum of losses. count: () number of annotated items, without gradient.
     """
 
     total: Tensor
@@ -50,12 +50,12 @@ class Sum:
         return Sum(self.total + other.total, self.count + other.count)
 
     def times(self, factor: float) -> Sum:
-        """The same, of less weight."""
+        """The same with its weight multiplied by a factor."""
         return Sum(factor * self.total, factor * self.count)
 
     @property
     def mean(self) -> Tensor:
-        """() 0 where nothing counts."""
+        """() the mean; 0 for an empty sum."""
         return self.total / torch.where(self.count > 0, self.count, torch.ones_like(self.count))
 
     @classmethod
@@ -76,12 +76,12 @@ def make_unrolled(config: Config) -> Objective:
 def unrolled_loss(
     model: JointScanCRF, batch: ScanPairBatch, config: UnrolledConfig, start: Start | None = None, **layer_inputs: Any
 ) -> dict[str, Tensor]:
-    """The terms `association`, `cluster`, `rotation`, `translation`, each a mean over what counts, and their weighted `total`: ().
+    """The terms `association`, `cluster`, `rotation`, `translation`, means over annotated items, and the weighted `total`: ().
 
     Args:
         batch: annotated pairs.
         config: overrides the model's rounds, motion weights and `detach_motion`.
-        start: motions to begin with; looked for where absent.
+        start: initial motions; None: from InitialiseRT.
         layer_inputs: `source_embedding`, `target_embedding`, `extra_log_unary` as in `forward`.
     """
     return mean_terms(unrolled_sums(model, batch, config, start, **layer_inputs), config)
@@ -96,7 +96,7 @@ def mean_terms(sums: dict[str, Sum], config: UnrolledConfig) -> dict[str, Tensor
 def unrolled_sums(
     model: JointScanCRF, batch: ScanPairBatch, config: UnrolledConfig, start: Start | None = None, **layer_inputs: Any
 ) -> dict[str, Sum]:
-    """The terms of `unrolled_loss` as sums and counts. A chain that the model has not counts nothing."""
+    """The terms of `unrolled_loss` as sums and counts. A chain missing in the model has count 0."""
     if batch.truth is None:
         raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
     start = start or model.initialise(batch)
@@ -117,12 +117,12 @@ def unrolled_sums(
 
 
 def add(sums: Sequence[Sum]) -> Sum:
-    """All of them in one."""
+    """Adds several sums."""
     return reduce(Sum.__add__, sums)
 
 
 def unrolled_settings(model: ModelConfig, config: UnrolledConfig) -> ModelConfig:
-    """The model's settings with rounds that gradients pass through."""
+    """The model's settings with rounds through which gradients pass."""
     model.require("has_gradient", "for the objective unrolled")
     inference = replace(
         model.inference,
@@ -135,7 +135,7 @@ def unrolled_settings(model: ModelConfig, config: UnrolledConfig) -> ModelConfig
 
 
 def round_weights(config: UnrolledConfig) -> list[float]:
-    """Weights of the last rounds that count, the last one's 1."""
+    """Weights of the rounds in the loss, the last one's being 1."""
     if config.deep_supervision == 0:
         return [1.0]
     return [config.deep_supervision**age for age in reversed(range(config.iterations))]
@@ -152,7 +152,7 @@ def association_sum(batch: ScanPairBatch, state: State, config: UnrolledConfig) 
 
 
 def cluster_sum(batch: ScanPairBatch, state: State, slots: Tensor, config: UnrolledConfig) -> Sum:
-    """Cross-entropy of the slot that stands for the true cluster, or of the outlier. slots: (B, G) of `match_clusters`."""
+    """Cross-entropy of the slot matched to the true cluster, or of the outlier. slots: (B, G) of `match_clusters`."""
     truth = _truth_of(batch)
     slot = slots.gather(1, truth.cluster.clamp(min=0))  # (B, N)
     label = torch.where(truth.cluster < 0, state.log_cluster.shape[-1] - 1, slot)
@@ -161,14 +161,14 @@ def cluster_sum(batch: ScanPairBatch, state: State, slots: Tensor, config: Unrol
 
 
 def cross_entropy(log_beliefs: Tensor, label: Tensor, known: Tensor, temperature: float) -> Sum:
-    """Of labels that are possible. log_beliefs: (B, N, S); label: (B, N); known: (B, N)."""
+    """Cross-entropy of the possible labels. log_beliefs: (B, N, S); label: (B, N); known: (B, N)."""
     chosen = soften(log_beliefs, known, temperature).gather(-1, label[..., None])[..., 0]
     known = known & (chosen > -torch.inf)
     return Sum.over(-torch.where(known, chosen, torch.zeros_like(chosen)), known)
 
 
 def soften(log_beliefs: Tensor, known: Tensor, temperature: float) -> Tensor:
-    """(B, N, S) log-beliefs at a read-out temperature; uniform where nobody knows. known: (B, N)."""
+    """(B, N, S) log-beliefs at a read-out temperature; uniform at unannotated points. known: (B, N)."""
     beliefs = torch.where(known[..., None], log_beliefs, torch.zeros_like(log_beliefs))
     return torch.log_softmax(beliefs / temperature, dim=-1)
 
@@ -199,11 +199,11 @@ def members_of(batch: ScanPairBatch) -> Tensor:
 
 @torch.no_grad()
 def match_clusters(batch: ScanPairBatch, state: State, temperature: float) -> Tensor:
-    """(B, G) cluster of the state that stands for every true one, -1 none. One to one, the most alike first; 0 stands for 0.
+    """(B, G) cluster of the state matched to every true one, -1 none. One to one, the most similar first; 0 is matched to 0.
 
-    A predicted mover is like a true one by the share of its points that it holds, softly (its belief there), and by its motion:
-    1 / (1 + (error / tolerance)^2) of where those points land. So a mover found by the start keeps its points as a goal even where
-    the present weights give them to the background.
+    The similarity of a predicted mover is its soft share of the true one's points (its belief there) plus the agreement of motions:
+    1 / (1 + (error / tolerance)^2) of the moved points. So a mover found by the start remains the label of its points even if
+    the present weights assign them to the background.
     """
     motions = state.motions
     members = members_of(batch)  # (B, G, N)
@@ -224,16 +224,16 @@ def match_clusters(batch: ScanPairBatch, state: State, temperature: float) -> Te
 
 
 def closeness(batch: ScanPairBatch, share: Tensor, motions: Tensor) -> Tensor:
-    """(B, G, C) 1 where a motion carries a true cluster's points as its true one, a half at the tolerance of `match_start`.
+    """(B, G, C) agreement of motions with a true cluster's on its points: 1 if equal, 1/2 at the tolerance of `match_start`.
 
-    share: (B, G, N) of the cluster's points; motions: (B, C, 3). 0 where the true motion is not known.
+    share: (B, G, N) of the cluster's points; motions: (B, C, 3). 0 where the true motion is unknown.
     """
     truth = _truth_of(batch)
     true_points = se2.apply(truth.motions.nan_to_num(), batch.source[:, None])  # (B, G, N, 2)
     points = se2.apply(motions, batch.source[:, None])  # (B, C, N, 2)
     error = torch.stack(
         [(torch.linalg.vector_norm(true_points - points[:, c, None], dim=-1) * share).sum(-1) for c in range(motions.shape[1])], -1
-    )  # a motion at a time: the largest tensor stays (B, G, N, 2)
+    )  # one motion at a time, so that the largest tensor is (B, G, N, 2)
     travel = (torch.linalg.vector_norm(true_points - true_points[:, :1], dim=-1) * share).sum(-1)
     tolerance = torch.maximum(TRAVEL_SHARE * travel, 2 * batch.range_noise[:, None] + LEAST_GAP)
     is_known = truth.motions.isfinite().all(-1)

@@ -1,4 +1,4 @@
-"""How good a model in training is on pairs that nothing is fitted on: losses and answers, shared out among the processes."""
+"""Validation of a model in training: losses and predictions on held-out pairs, divided among the processes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Answers:
 
     Attributes:
         pairs: P pairs. predictions: by method, P of them.
-        moving: P arrays (N,), how sure the model is that a return moves, by its beliefs.
+        moving: P arrays (N,), the belief that a return moves.
         example: a batch of some of the pairs and its start.
     """
 
@@ -41,7 +41,7 @@ class Answers:
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """Validation pairs; `places` of them in parts, surveyed, are this process's share. `rivals`: by place, RANSAC's answers."""
+    """Validation pairs; this process has those at `places`, in surveyed parts. `rivals`: by place, predictions of RANSAC."""
 
     pairs: tuple[ScanPair, ...]
     places: tuple[tuple[int, ...], ...]
@@ -50,15 +50,15 @@ class Validation:
 
     @classmethod
     def of(cls, pairs: Sequence[ScanPair], part: int, ranks: Ranks) -> Validation:
-        """Looks at this process's parts of the pairs, `part` pairs each."""
+        """Surveys this process's share of the pairs, in parts of `part` pairs."""
         parts = [tuple(range(k, min(k + part, len(pairs)))) for k in range(0, len(pairs), part)][ranks.rank :: ranks.world]
-        rivals = {k: match_ransac(pairs[k]) for places in parts for k in places}  # once: it learns nothing
+        rivals = {k: match_ransac(pairs[k]) for places in parts for k in places}  # only once, as it does not learn
         portions = tuple(as_portion([pairs[k] for k in places]) for places in parts)
         return cls(tuple(pairs), tuple(parts), portions, rivals)
 
     @torch.no_grad()
     def losses(self, model: JointScanCRF, objective: Objective, ranks: Ranks) -> dict[str, float]:
-        """Every term, per known node of all pairs; the same in every process."""
+        """Every term, per annotated node of all pairs; the same in every process."""
         sums: dict[str, float] = {}
         weight = 0.0
         with evaluating(model):
@@ -75,7 +75,7 @@ class Validation:
 
     @torch.no_grad()
     def answers(self, model: JointScanCRF, ranks: Ranks) -> Answers | None:
-        """The answers of the model, of its start without a random field and of RANSAC, in the first process; None in the others."""
+        """Predictions of the model, of its start without a random field and of RANSAC, in the first process; None in the others."""
         found: dict[str, dict[int, PairPrediction]] = {"joint": {}, BASELINE: {}, RIVAL: self.rivals}
         moving: dict[int, Floats] = {}
         example = None
@@ -101,7 +101,7 @@ class Validation:
 
 @contextmanager
 def evaluating(module: nn.Module) -> Iterator[None]:
-    """A module in evaluation mode for the length of a block."""
+    """Context in which a module is in evaluation mode."""
     was_training = module.training
     module.eval()
     try:

@@ -21,7 +21,7 @@ Watch = Callable[[int, float, float, Tensor], None]
 
 
 def flatten(designs: Sequence[Design]) -> Design:
-    """All known nodes of many batches as one row of nodes: features (1, P, S, W), float64."""
+    """All annotated nodes of many batches as one row of nodes: features (1, P, S, W), float64."""
     states = max(design.features.shape[2] for design in designs)
 
     def rows(design: Design) -> tuple[Tensor, Tensor, Tensor]:
@@ -38,11 +38,11 @@ def flatten(designs: Sequence[Design]) -> Design:
 
 
 def fit_chain(chains: Iterable[AnyChain], live: Tensor, config: LearningConfig, watch: Watch | None = None) -> Tensor:
-    """The weights of a chain or the lattice by `config.objective`: pseudo-likelihood, or from its optimum on exact likelihood.
+    """The weights of a chain or the lattice by `config.objective`: pseudo-likelihood, or exact likelihood started at its optimum.
 
     Args:
-        chains: batches; pseudo-likelihood looks at one after the other and keeps no transitions, of which dense chains have many.
-        live: (W,) 1 for the weights that are learned, 0 for those that stay 0.
+        chains: batches; pseudo-likelihood processes one at a time and keeps no transitions, of which dense chains have many.
+        live: (W,) 1 for the weights that are learned, 0 for those fixed at 0.
 
     Returns:
         (W,) float64.
@@ -54,7 +54,7 @@ def fit_chain(chains: Iterable[AnyChain], live: Tensor, config: LearningConfig, 
 
     def look(step: int, loss: float, slope: float, weights: Tensor) -> None:
         nonlocal done
-        done += 1  # the steps of both objectives are one row
+        done += 1  # steps of both objectives are numbered consecutively
         if watch is not None:
             watch(done, loss, slope, weights)
 
@@ -66,7 +66,7 @@ def fit_chain(chains: Iterable[AnyChain], live: Tensor, config: LearningConfig, 
 
 
 def stack(chains: Sequence[AnyChain]) -> AnyChain:
-    """Many batches of chains as one, padded, float64 and without a gradient of their own; outliers stay the last states."""
+    """Many batches of chains as one, padded, float64 and detached; outliers stay the last states."""
     first = chains[0]
     lengths: dict[str, int] = {}
     for chain in chains:
@@ -90,7 +90,7 @@ def stack(chains: Sequence[AnyChain]) -> AnyChain:
 
 
 def _lengthen(values: Tensor, dim: int, length: int, *, is_states: bool) -> Tensor:
-    """Puts zeros at the end of an axis, or before its last entry where that is the outlier state."""
+    """Appends zeros to an axis, or inserts them before its last entry if that is the outlier state."""
     last = values.shape[dim] - int(is_states)
     shape = list(values.shape)
     shape[dim] = length - values.shape[dim]
@@ -110,14 +110,14 @@ def fit_weights(
     """Minimises -log likelihood + w^T w / (2 s_w^2) by L-BFGS, w in units of the features' spread; convex, so one optimum.
 
     Args:
-        design: one row of nodes, see `flatten`; its log pseudo-likelihood is the objective where no other is given.
+        design: one row of nodes, see `flatten`; its log pseudo-likelihood is the default objective.
         watch: called with (step, objective per node, largest gradient entry per node, weights) after every step.
-        live: (W,) 1 for the weights that are learned, 0 for those that stay 0; None: all.
-        start: (W,) weights to begin with; None: 0.
+        live: (W,) 1 for the weights that are learned, 0 for those fixed at 0; None: all.
+        start: (W,) initial weights; None: 0.
         log_likelihood: (W,) -> (), another objective on the same features.
 
     Returns:
-        (W,) float64 weights for the features as they are.
+        (W,) float64 weights for unscaled features.
     """
     spread = design.features[design.mask].std(dim=0)
     per_unit = 1 / torch.where(spread > 1e-9, spread, torch.ones_like(spread))
@@ -142,7 +142,7 @@ def fit_weights(
             watch(step, latest["loss"], latest["slope"], torch.from_numpy(intermediate_result.x) * per_unit)
 
     first = torch.zeros_like(per_unit) if start is None else torch.where(per_unit > 0, start / per_unit.clamp(min=1e-12), 0.0)
-    idle = 0.0 if log_likelihood is None else 0.1 * config.tolerance  # relative gain of a step: exact ones are dear
+    idle = 0.0 if log_likelihood is None else 0.1 * config.tolerance  # least relative gain of a step: exact steps are expensive
     options = {"maxiter": config.max_steps, "gtol": config.tolerance, "ftol": idle, "maxcor": 10}
     found = minimize(objective, first.numpy(), jac=True, method="L-BFGS-B", callback=look, options=options)
     return torch.from_numpy(found.x) * per_unit

@@ -1,1 +1,1 @@
-"""Schedules, starts and couplings beside the default ones, and the register that loads them by name."""
+"""Schedules, starts and couplings other than the defaults, and the register that loads them by name."""

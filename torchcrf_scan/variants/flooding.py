@@ -1,8 +1,8 @@
-"""Algorithm 1 as it is printed: node by node, the motions re-estimated after every visit (spec 7.2, `flooding`).
+"""Algorithm 1 as printed: node by node, the motions re-estimated after every visit (spec 7.2, `flooding`).
 
 Slow and faithful. Visits run x_c_1..x_c_N, x_a_1..x_a_N, ascending or in alternating direction (A-20); each visit rebuilds the
-node's local features from the present motions and plug-ins, sends its messages, takes its label and updates the running sums of
-its clusters. The association's candidates are chosen anew before every iteration and its messages carried over by target point.
+node's local features from the present motions and plug-ins, sends its messages, updates its label and the running sums of
+its clusters. The association candidates are chosen anew before every iteration and messages carried over by target point.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Messages:
 
     @classmethod
     def zeros(cls, B: int, N: int, S: int, like: Tensor) -> Messages:
-        """Nothing has been said yet."""
+        """Initial messages, all 0."""
         return cls(like.new_zeros(B, N, S), like.new_zeros(B, N, S))
 
 
@@ -74,7 +74,7 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
 
 
 class Flooding:
-    """The moving parts of one run: state, messages of both chains, running sums of every cluster."""
+    """Working state of one run: labels and motions, messages of both chains, running sums of every cluster."""
 
     def __init__(self, view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> None:
         self.view, self.start, self.parameters, self.model = view, start, parameters, model
@@ -85,11 +85,11 @@ class Flooding:
 
     @property
     def config(self) -> InferenceConfig:
-        """How to decode."""
+        """The settings of inference."""
         return self.model.inference
 
     def iterate(self, descending: bool) -> None:
-        """One visit to every node of every chain that the model has."""
+        """One visit to every node of every chain of the model."""
         batch = self.view.batch
         self.sums = self._running_sums()
         found = find_candidates(self.view, self.state.motions.value, self.state.motions.active, self.config)
@@ -104,7 +104,7 @@ class Flooding:
         self._retire_empty()
 
     def said(self) -> list[Tensor]:
-        """All messages as they are now."""
+        """Copies of all messages."""
         both = (self.cluster_messages, self.association_messages)
         return [message.clone() for messages in both for message in (messages.forward, messages.backward)]
 
@@ -117,7 +117,7 @@ class Flooding:
         return torch.stack(steady).all(0)
 
     def visit_cluster(self, i: int, found: Candidates) -> None:
-        """Local features, messages to both neighbours, label, motions: one node of the clustering chain."""
+        """Visits one node of the clustering chain: local features, messages to both neighbours, label, motions."""
         batch, state, scales = self.view.batch, self.state, self.parameters.scales
         here = slice(i, i + 1)
         around = slice(max(i - 1, 0), min(i + 2, batch.source.shape[1]))
@@ -139,7 +139,7 @@ class Flooding:
         self._relabel(i, replace(state, log_cluster=log_cluster, cluster=cluster))
 
     def visit_association(self, i: int) -> None:
-        """The same for one node of the association chain."""
+        """Visits one node of the association chain, likewise."""
         batch, state, scales, boosters = self.view.batch, self.state, self.parameters.scales, self.parameters.boosters
         here = slice(i, i + 1)
         motions, active = state.motions.value, state.motions.active
@@ -161,7 +161,7 @@ class Flooding:
         self._relabel(i, state)
 
     def _send(self, messages: Messages, i: int, unary: Tensor, before: Tensor | None, after: Tensor | None) -> Tensor:
-        """Sends node i's messages to its neighbours; padding sends nothing. Returns its belief (B, S)."""
+        """Sends node i's messages to its neighbours; padding sends none. Returns its belief (B, S)."""
         mask = self.view.batch.source_mask
         temperature = self.config.temperature
         if after is not None:
@@ -173,11 +173,11 @@ class Flooding:
         return unary + messages.forward[:, i] + messages.backward[:, i]
 
     def _normalised(self, belief: Tensor) -> Tensor:
-        """Log-beliefs as `chain_beliefs` gives them."""
+        """Log-beliefs normalised as in `chain_beliefs`."""
         return torch.log_softmax(belief / self.config.temperature if self.config.temperature else belief, -1)
 
     def _relabel(self, i: int, state: State) -> None:
-        """ComputeRT after node i took a new label or partner, in O(1) (spec 7.4)."""
+        """ComputeRT after node i changed its label or partner, in O(1) (spec 7.4)."""
         target, C = self.view.batch.target, state.motions.value.shape[1]
 
         def vote(of: State) -> tuple[Tensor, Tensor]:
@@ -196,7 +196,7 @@ class Flooding:
         return RunningSums.of(batch.source, gather_points(batch.target, state.association.clamp(min=0)), weights)
 
     def _take_candidates(self, found: Candidates) -> None:
-        """New inlier states for every node; messages follow their target points, a new one hears the least that was said."""
+        """Sets new inlier states of every node; messages follow their target points, a new state takes the smallest entry."""
         batch, scales = self.view.batch, self.parameters.scales
         old, old_mask = self.state.candidates, self.state.candidate_mask
         same = (found.index[..., :, None] == old[..., None, :]) & old_mask[..., None, :]  # (B, N, K new, K old)
@@ -218,5 +218,5 @@ class Flooding:
         self.state = replace(self.state, candidates=found.index, candidate_mask=found.mask, log_association=log)
 
     def _retire_empty(self) -> None:
-        """Clusters without a point for two iterations are removed (spec 7.5)."""
+        """Removes clusters without a point for two iterations (spec 7.5)."""
         self.state = replace(self.state, motions=retire_empty(self.state.motions, self.sums.value[..., 0].round()))

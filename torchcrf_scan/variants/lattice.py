@@ -1,4 +1,4 @@
-"""Exact messages on a chain of super-nodes (j, k), without ever building its A D x A D transitions (spec 7.7).
+"""Exact messages on a chain of super-nodes (j, k), without forming its A D x A D transitions (spec 7.7).
 
 A message is reduced over the association states for each kind of cluster transition, then over the clusters:
 
@@ -32,7 +32,7 @@ class LatticeBeliefs:
 
     Attributes:
         log_joint: (B, N, A, D) of both labels.
-        log_association: (B, N, A), log_cluster: (B, N, D) of one label, over the other; max-marginals at temperature 0.
+        log_association: (B, N, A), log_cluster: (B, N, D) of one label, reduced over the other; max-marginals at temperature 0.
     """
 
     log_joint: Tensor
@@ -42,7 +42,7 @@ class LatticeBeliefs:
     def best(self) -> tuple[Tensor, Tensor]:
         """(B, N) association and cluster states: the best cluster, and the best association in it.
 
-        At temperature 0 that is the best super-node. Above, an inlier's belief is spread over like candidates and an outlier's is
+        At temperature 0 that is the best super-node. Above, an inlier's belief is spread over similar candidates, an outlier's is
         not, so the best single super-node would too often be the outlier.
         """
         cluster = self.log_cluster.argmax(-1)
@@ -51,7 +51,7 @@ class LatticeBeliefs:
 
 
 def both_directions(forward: Tensor, *, is_edge: bool) -> Tensor:
-    """(2B, ...) a chain's tensor and that of the reversed chain. forward: (B, N, ...), of an edge (B, N-1, S, S, ...)."""
+    """(2B, ...) a chain's tensor and that of the reversed chain. forward: (B, N, ...), or (B, N-1, S, S, ...) with `is_edge`."""
     backward = forward.flip(1)
     return torch.cat([forward, backward.transpose(2, 3) if is_edge else backward])
 
@@ -76,7 +76,7 @@ def lattice_messages(potentials: LatticePotentials, temperature: float = 0.0) ->
 
 
 def lattice_beliefs(potentials: LatticePotentials, mask: Tensor, temperature: float = 0.0) -> LatticeBeliefs:
-    """Beliefs of super-nodes and of either label; padding is silent. mask: (B, N)."""
+    """Beliefs of super-nodes and of either label; padding is ignored. mask: (B, N)."""
     potentials = potentials.cut(mask)
     forward, backward = lattice_messages(potentials, temperature)
     beliefs = potentials.log_unary + forward + backward
@@ -96,7 +96,7 @@ class _LogPartition(torch.autograd.Function):
     """Sum-product by small matrix products, and its gradient from forward and backward messages.
 
     Several times as fast as differentiating `lattice_messages`. Transitions more than about 700 (float32: 80) below the best of
-    their edge vanish.
+    their edge underflow to 0.
     """
 
     @staticmethod

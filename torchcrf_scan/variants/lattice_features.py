@@ -1,9 +1,10 @@
 """Features of the lattice: association and clustering joined into super-nodes (j, k), spec 7.7.
 
 A super-node's states are pairs of an association state j (K candidates, the outlier last: A = K + 1) and a cluster k (C clusters,
-the outlier last: D = C + 1). The named weights stay, but nothing is plugged in any more: every feature sees its own j and k.
-Transitions (j, k) -> (j', k') are never spelled out as an A D x A D table. They are A(j, j') + C(k, k') and, for stiffness and
-elongation, a third term that needs both, but of k and k' only whether they are the same inlier cluster, two, or the outlier.
+the outlier last: D = C + 1). The named weights are those of two chains, but without plug-ins: features use their own j and k.
+Transitions (j, k) -> (j', k') are never formed as an A D x A D table. They are A(j, j') + C(k, k') and, for stiffness and
+elongation, a third term of both labels, which depends on k and k' only by the kind of transition: same inlier cluster, two
+different ones, or the outlier.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from torchcrf_scan.names import (
     STATIC_CHANNELS,
 )
 
-# Where the features' weights are among all, association before clustering.
+# Positions of the features' weights in the joined vector, association before clustering.
 FIRST_CLUSTERING = len(ASSOCIATION_WEIGHTS)
 FIRST_EDGE = FIRST_CLUSTERING + CLUSTERING_UNARY
 _DATA_BOOSTING, _OUTLIER_BOOSTING = (ASSOCIATION_WEIGHTS.index(name) for name in BOOSTING)
@@ -74,7 +75,7 @@ class LatticePotentials:
     log_cluster: Tensor
 
     def cut(self, known: Tensor) -> LatticePotentials:
-        """Without the nodes that are not known (B, N), padding for one, and without their edges."""
+        """Unknown nodes (False in known: (B, N)) become padding, without their edges."""
         edge = (known[:, 1:] & known[:, :-1])[..., None, None]
         none = torch.zeros((), dtype=self.log_unary.dtype, device=known.device)
         return LatticePotentials(
@@ -89,11 +90,11 @@ class LatticeFeatures:
     """Features of super-nodes and their transitions.
 
     Attributes:
-        static: (B, N, A, 12) what depends on j alone: L1..L11 and the outlier booster's margin.
+        static: (B, N, A, 12) features of j alone: L1..L11 and the outlier booster's margin.
         moving: (B, N, A, D, 19) registered translation, the data booster's margin, the association's extension, C1..C4, the
             clustering's extension.
         pairwise_association: (B, N-1, A, A, 4) P1..P4.
-        elastic: (B, N-1, A, A, 3) Q4..Q6 of two candidates, for the kinds of cluster transitions that they belong to.
+        elastic: (B, N-1, A, A, 3) Q4..Q6 of two candidates, for the kinds of cluster transitions to which they apply.
         pairwise_cluster: (B, N-1, D, D, 8) Q1..Q8, without Q4..Q6.
         mask: (B, N, A, D) possible states.
     """
@@ -112,7 +113,7 @@ class LatticeFeatures:
         log_association = (self.pairwise_association @ weights[ASSOCIATION_PAIRWISE])[..., None] + self.elastic @ by_kind
         log_cluster = self.pairwise_cluster @ weights[CLUSTER_PAIRWISE]
         found = (log_unary.masked_fill(~self.mask, -torch.inf), log_association, log_cluster)
-        return LatticePotentials(*(value.to(self.static) for value in found))  # autocast ends here, as on two chains
+        return LatticePotentials(*(value.to(self.static) for value in found))  # autocast ends here, as with two chains
 
 
 def lattice_features(
@@ -172,7 +173,7 @@ def registered_channels(registered: Tensor, static_margin: Tensor, scales: Scale
 
 
 def cluster_channels(distance: Tensor, unexplained: Tensor) -> Tensor:
-    """C1..C4, (B, N, A, D, 4). distance: (B, N, K, C) of inlier states; unexplained: (B, N) no motion meets a target point.
+    """C1..C4, (B, N, A, D, 4). distance: (B, N, K, C) of inlier states; unexplained: (B, N) no motion is near a target point.
 
     In the training truth a point is an outlier of both labels or of none, so C3 and C4 alone separate it (A-28): only the prior
     bounds their weights.
@@ -195,7 +196,7 @@ def extension_channels(
 ) -> tuple[Tensor, Tensor]:
     """Both chains' extensions of every super-node, (B, N, A, D, 5) and (B, N, A, D, 8).
 
-    A point in the outlier cluster is looked at where its background's motion takes it. An outlier of the association meets the
+    A point in the outlier cluster is evaluated under the background's motion. An outlier of the association is compared with the
     nearest target point. at: the points without associations; distance: (B, N, K, C).
     """
     K, C = distance.shape[2:]

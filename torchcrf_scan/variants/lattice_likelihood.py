@@ -1,4 +1,4 @@
-"""How likely the annotation is to the lattice: super-node by super-node, and exactly (spec 6.2, 6.5, 7.7)."""
+"""Likelihood of the annotation under the lattice: pseudo-likelihood by super-nodes, and exact (spec 6.2, 6.5, 7.7)."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ WEIGHTS = len(ASSOCIATION_WEIGHTS) + len(CLUSTERING_WEIGHTS)
 
 @dataclass(frozen=True, slots=True)
 class LatticeChain(LatticeFeatures):
-    """The lattice's features and the truth; what `pseudo_likelihood.Chain` is to one chain.
+    """The lattice's features and the true labels; the counterpart of `pseudo_likelihood.Chain`.
 
     Attributes:
         association, cluster: (B, N) true states, the outliers last.
-        known: (B, N) nodes both of whose labels count; the others cut the chain.
+        known: (B, N) nodes both of whose labels are annotated; the others cut the chain.
         axes, labels: as in `pseudo_likelihood.Chain`; a association states, d clusters.
     """
 
@@ -54,7 +54,7 @@ class LatticeChain(LatticeFeatures):
     known: Tensor
 
     def design(self) -> Design:
-        """The 43 features of every super-node at its true neighbours; state (j, k) is j D + k."""
+        """The 43 features of every super-node at its true neighbours; the index of state (j, k) is j D + k."""
         D = self.mask.shape[3]
         features = self.moving.new_zeros(*self.mask.shape, WEIGHTS)
         features[..., list(STATIC_WEIGHTS)] = self.static[:, :, :, None]
@@ -67,7 +67,7 @@ class LatticeChain(LatticeFeatures):
         return Design(features.flatten(2, 3), self.mask.flatten(2), self.association * D + self.cluster, self.known)
 
     def _elastic_at_true_neighbours(self) -> Tensor:
-        """(B, N, A, D, 3): the only features of both labels and both labels of a neighbour."""
+        """(B, N, A, D, 3): the only features of both labels of a node and of its neighbour."""
         D = self.mask.shape[3]
         by_kind = self.elastic.new_tensor(ELASTIC_KINDS).T[transition_kinds(D, self.mask.device)]  # (D, D, 3)
         by_kind = by_kind.expand(*self.elastic.shape[:2], D, D, 3)
@@ -81,7 +81,7 @@ class LatticeChain(LatticeFeatures):
         return self._score(potentials) - lattice_log_partition(potentials)
 
     def _score(self, potentials: LatticePotentials) -> Tensor:
-        """(B,) score of the truth."""
+        """(B,) score of the true labels."""
         A, D = self.mask.shape[2:]
         j, k = self.association, self.cluster
         kind = transition_kinds(D, k.device)[k[:, :-1], k[:, 1:]]
@@ -94,9 +94,9 @@ class LatticeChain(LatticeFeatures):
 
 
 def lattice_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> LatticeChain:
-    """The lattice at the plug-ins' motions; of the other plug-ins it needs only the true clusters.
+    """The lattice at the plug-ins' motions; of the other plug-ins only the true clusters are used.
 
-    States are the candidates of the decoding and the truth, times the clusters.
+    States are the candidates of inference and the true target point, times the clusters.
     """
     batch, truth = view.batch, view.batch.truth
     assert truth is not None

@@ -1,4 +1,4 @@
-"""The paper configuration's start (spec 7.3, A-19): the association chain alone, then runs of points that it moved elsewhere."""
+"""The start of the paper's configuration (spec 7.3, A-19): the association chain alone, then runs of points with other motions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchcrf_scan.loops.pair import array_of
 from torchcrf_scan.search.cold import ransac_motions
 
 INDEX_GAP = 3
-SPATIAL_GAP = 0.75  # metres, as the two below: the paper's car and scanner
+SPATIAL_GAP = 0.75  # metres, as the next two: sizes for the paper's car and scanner
 EXPLAINED = 0.3
 FEWEST = 4
 ROUNDS = 3
@@ -32,7 +32,7 @@ def paper_start(view: PairView, found: Start, parameters: Parameters, config: In
     """CRF-Matching's motion as background, and up to C - 1 movers from the runs of its residuals.
 
     Args:
-        found: any start of C clusters; its association and tangents are where the search begins, its motions are not looked at.
+        found: any start of C clusters; its association and tangents begin the search, its motions are not used.
     """
     clusters = found.motions.shape[1]
     background, association = match_cold(view, found, parameters, config)
@@ -40,9 +40,9 @@ def paper_start(view: PairView, found: Start, parameters: Parameters, config: In
 
 
 def match_cold(view: PairView, found: Start, parameters: Parameters, config: InferenceConfig) -> tuple[Tensor, Tensor]:
-    """Step 1 of spec 7.3: the association chain from standstill (or odometry), and one motion that most of it agrees with.
+    """Step 1 of spec 7.3: the association chain from standstill (or odometry), and the motion that most associations support.
 
-    Nothing is known of the motion at first, so the candidates are those that look alike (design finding 5).
+    No motion is known at first, so the candidates are the most similar in shape (design finding 5).
 
     Returns:
         (B, 3) motion of the background and (B, N) associations.
@@ -59,7 +59,7 @@ def match_cold(view: PairView, found: Start, parameters: Parameters, config: Inf
 
 
 def agreed_motion(batch: ScanPairBatch, before: Tensor, association: Tensor) -> Tensor:
-    """(B, 1, 3) the two-point motion that most associations agree with, and Kabsch on those; `before` where there is none."""
+    """(B, 1, 3) the two-point motion with most inlier associations, refined by Kabsch on those; `before` if there is none."""
     motions = before.clone()
     for b in range(len(batch)):
         index = (association[b] >= 0).nonzero()[:, 0]

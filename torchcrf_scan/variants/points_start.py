@@ -1,4 +1,4 @@
-"""The start of the paper's own remark: one cluster a point (D = M + 1), and clusters that no point prefers are discarded (A-19)."""
+"""A start with one cluster per point (D = M + 1), as the paper remarks; clusters preferred by no point are discarded (A-19)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.names import CLUSTERING_UNARY, PAPERS_CLUSTER
 from torchcrf_scan.variants.paper_start import FEWEST, match_cold
 
-PAPERS_UNARY = len(PAPERS_CLUSTER)  # C1..C4; the extensions are not for so many clusters
-EDGES = 16  # whose transition tables are made at once: one has D^2 entries of 8 features
+PAPERS_UNARY = len(PAPERS_CLUSTER)  # C1..C4; the extensions are not used with so many clusters
+EDGES = 16  # edges per block of transition tables: one has D^2 entries of 8 features
 
 
 @torch.no_grad()
 def points_start(view: PairView, found: Start, parameters: Parameters, config: InferenceConfig) -> Start:
-    """The C largest clusters that are left of one a point; the largest is the background.
+    """The C largest remaining clusters of one per point; the largest is the background.
 
     CRF-Matching's associations from standstill give every point a translation, its motion gives all of them the rotation. One exact
-    pass over the clustering chain with that many states tells which points move alike. Costs N D^2 = N^3 a pair.
+    pass over the clustering chain with that many states then groups points of equal motion. Costs N D^2 = N^3 a pair.
     """
     batch, clusters = view.batch, found.motions.shape[1]
     background, association = match_cold(view, found, parameters, config)
@@ -61,7 +61,7 @@ def cluster_by_point(view: PairView, b: int, background: Tensor, association: Te
     log_unary = (local @ parameters.clustering[:PAPERS_UNARY]).masked_fill(~possible, -torch.inf)
     log_pairwise = edge_potentials(source, at, parameters)
     mask = batch.source_mask[b : b + 1]
-    label = chain_beliefs(log_unary, log_pairwise, mask).argmax(-1)[0]  # that of the outlier is no cluster here
+    label = chain_beliefs(log_unary, log_pairwise, mask).argmax(-1)[0]  # the outlier's label is not an index of a cluster here
     members = (label == torch.arange(len(association), device=label.device)[:, None]) & (association >= 0)  # (N clusters, N)
     size = members.sum(-1)
     order = size.argsort(descending=True, stable=True)

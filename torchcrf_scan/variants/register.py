@@ -1,4 +1,4 @@
-"""The functions of the variants that `choices` declares, by name."""
+"""Functions of the variants declared in `choices`, by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The schedule `sweep` with the coupling that the model names: `inference.joint` with its update."""
+"""The schedule `sweep` with the model's coupling: `inference.joint` with its update."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Viz."""
+"""Figures of pairs, predictions and confidences."""

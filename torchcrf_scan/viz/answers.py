@@ -1,4 +1,4 @@
-"""The answers that a figure shows: labels by source beam, movers numbered as the true ones, and the mistakes to ring."""
+"""Labels to draw: by source beam, movers numbered as the true ones, with the mistakes to mark."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from torchcrf_scan.evaluation.counterparts import match_movers
 from torchcrf_scan.scan import BACKGROUND, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 
-ASSOCIATION_TOLERANCE = 2  # beams: an association this near is drawn as right
+ASSOCIATION_TOLERANCE = 2  # beams; associations within this distance are drawn as right
 
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """One answer for a pair, by source beam, its movers numbered as the annotation's where they match; unknown motions are NaN."""
+    """Labels of a pair by source beam, movers numbered as the annotation's if they match; unknown motions are NaN."""
 
     association: Ints
     cluster: Ints
@@ -33,7 +33,7 @@ class Labels:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Labels with a name, and which associations and clusters to ring: the prediction's mistakes, None without a truth."""
+    """Labels with a name and masks of wrong associations and clusters; None without an annotation."""
 
     name: str
     labels: Labels
@@ -42,12 +42,12 @@ class Answer:
 
 
 def true_labels(pair: ScanPair) -> Labels | None:
-    """The annotation, None where there is none."""
+    """The annotated labels, None without an annotation."""
     return None if pair.annotation is None else _labels(pair, "annotation", pair.annotation)
 
 
 def predicted_labels(pair: ScanPair, name: str, prediction: PairPrediction, truth: Labels | None) -> Labels:
-    """The prediction, its movers numbered as the true ones; ValueError, which names it, where it does not fit the pair."""
+    """The predicted labels, movers numbered as the true ones; raises ValueError, with the name, if they do not fit the pair."""
     labels = _labels(pair, name, prediction)
     return labels if truth is None else _renumber(labels, truth)
 
@@ -64,7 +64,7 @@ def _labels(pair: ScanPair, name: str, given: Annotation | PairPrediction) -> La
 
 
 def _renumber(labels: Labels, truth: Labels) -> Labels:
-    """Gives every mover the number of the true one it overlaps most (one to one, largest overlap in all), others new numbers."""
+    """Gives every mover the number of the true one it overlaps most (one to one, maximum total overlap), others new numbers."""
     matched = {theirs: ours for ours, theirs in match_movers(truth.cluster, labels.cluster).items()}
     first_new = max([len(truth.motions) - 1, *truth.movers.tolist(), 0]) + 1
     new = {k: first_new + i for i, k in enumerate(k for k in labels.movers.tolist() if k not in matched)}
@@ -77,7 +77,7 @@ def _renumber(labels: Labels, truth: Labels) -> Labels:
 
 
 def judge(name: str, drawn: Labels, pair: ScanPair, guess: Labels, truth: Labels) -> Answer:
-    """The labels `drawn` with the mistakes of `guess` to ring; what nobody annotated is never wrong."""
+    """The labels `drawn` with the mistakes of `guess`; unannotated points are never mistakes."""
     assert pair.annotation is not None
     known = ~pair.annotation.ignore
     known &= pair.source.to_beams(np.ones(len(pair.source), dtype=bool), False)
@@ -87,7 +87,7 @@ def judge(name: str, drawn: Labels, pair: ScanPair, guess: Labels, truth: Labels
 
 
 def all_answers(pair: ScanPair, predictions: Mapping[str, PairPrediction]) -> list[Answer]:
-    """The methods' answers in their order, then the truth; ValueError where there is neither."""
+    """The methods' labels in their order, then the true ones; raises ValueError if there are none."""
     truth = true_labels(pair)
     if truth is None and not predictions:
         raise ValueError("predictions: expected at least one method for a pair without annotation, got none")

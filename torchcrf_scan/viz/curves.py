@@ -1,4 +1,4 @@
-"""Figures of how sure answers are: reliability, precision and recall of what moves, a pair's confidences point by point."""
+"""Figures of confidences: reliability, precision and recall of moving points, confidences of a pair point by point."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIZE = 4.0  # inches of a panel
 
 
 def plot_reliability(answers: dict[str, tuple[ArrayLike, ArrayLike]]) -> Figure:
-    """Accuracy against confidence, a panel for each kind of answer; the diagonal is honest.
+    """Accuracy against confidence, one panel per kind of label; perfect calibration is the diagonal.
 
     answers: name -> (P,) confidences and (P,) whether they were right.
     """
@@ -45,7 +45,7 @@ def precision_recall(score: Floats, is_positive: ArrayLike) -> tuple[Floats, Flo
     positive = np.asarray(is_positive, dtype=bool)
     order = np.argsort(-score, kind="stable")
     right = np.cumsum(positive[order])
-    last = np.append(np.diff(score[order]) != 0, True) if len(score) else np.zeros(0, dtype=bool)  # equal scores go together
+    last = np.append(np.diff(score[order]) != 0, True) if len(score) else np.zeros(0, dtype=bool)  # equal scores form one threshold
     precision = right[last] / np.arange(1, len(score) + 1)[last]
     if not positive.any():
         return precision, np.full(len(precision), np.nan), float("nan")
@@ -58,7 +58,7 @@ def plot_precision_recall(curves: dict[str, tuple[Floats, ArrayLike]]) -> Figure
     figure, (ax,) = _panels(1)
     for (name, (score, moving)), color in zip(curves.items(), (SOURCE, TARGET, INK, NOTE), strict=False):
         precision, recall, average = precision_recall(score, moving)
-        # what a threshold gains in recall has its precision: the area below the curve is the average precision
+        # steps: the area under the curve is then the average precision
         ax.step(np.append(0 * recall[:1], recall), np.append(precision[:1], precision), where="pre", color=color,
                 label=f"{name}: average precision {average:.2f}")  # fmt: skip
     _frame(ax, "moving points", "recall", "precision")
@@ -67,7 +67,7 @@ def plot_precision_recall(curves: dict[str, tuple[Floats, ArrayLike]]) -> Figure
 
 
 def plot_confidence(pair: ScanPair, prediction: PairPrediction) -> Figure:
-    """The source points, coloured by how sure their association and their cluster are."""
+    """The source points, coloured by the confidences of their association and of their cluster."""
     figure, axes = _panels(2)
     points, beam = pair.source.points, pair.source.beam
     for ax, name in zip(axes, ("association", "cluster"), strict=True):

@@ -19,7 +19,7 @@ SMALLEST_TITLE = 6.5  # points
 
 
 def make_canvas(scene: Scene, rows: int, columns: int) -> tuple[Figure, list[list[Axes]]]:
-    """A figure and its panels, row by row; a panel stays invisible until it gets a frame."""
+    """A figure and its panels, row by row; a panel is invisible until it gets a frame."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -29,7 +29,7 @@ def make_canvas(scene: Scene, rows: int, columns: int) -> tuple[Figure, list[lis
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False)
     for ax in axes.flat:
-        ax.set_axis_off()  # until something is drawn on it
+        ax.set_axis_off()  # until the panel gets a frame
     return figure, [list(row) for row in axes]
 
 
@@ -53,12 +53,12 @@ def draw_frame(ax: Axes, window: Window, title: str, note: str, mistakes: str = 
 
 
 def _shrink(text: Text, room: float) -> None:
-    """Makes a text small enough for so many inches, but never illegible."""
+    """Reduces the font size of a text to a width in inches, but not below `SMALLEST_TITLE`."""
     text.set_fontsize(max(float(text.get_fontsize()) * min(1.0, room / max(_width(text), 1e-6)), SMALLEST_TITLE))
 
 
 def _width(text: Text) -> float:
-    """Inches."""
+    """Width in inches."""
     assert text.figure is not None
     return float(text.get_window_extent().width / text.figure.dpi)
 

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 SOURCE, TARGET = "#4F7396", "#F28E2B"
 STATIC, INK, NOTE, WRONG = "#A3A9B0", "#1F2328", "#57606A", "#C1121F"
-MOVERS = ("#009E73", "#CC5FA6", "#0072B2", "#D55E00", "#6F4E9C", "#35A7DB")  # after Okabe and Ito, told apart by the colour-blind
-MARKERS = "osD^v"  # the second six movers wear the second marker, and so on
-FAINT = 0.22  # opacity of what nobody annotated
-MAX_SPEED_LABELS = 10  # the largest movers, more would cover the picture
+MOVERS = ("#009E73", "#CC5FA6", "#0072B2", "#D55E00", "#6F4E9C", "#35A7DB")  # after Okabe and Ito, colour-blind safe
+MARKERS = "osD^v"  # one for every six movers
+FAINT = 0.22  # opacity of unannotated points
+MAX_SPEED_LABELS = 10  # labels of the largest movers only; more would cover the picture
 
 
 def draw_dots(
@@ -33,7 +33,7 @@ def draw_dots(
     size: float,
     marker: str = "o",
 ) -> None:
-    """Points of a mask, all without one; the faint ones are drawn as such and stay out of the legend."""
+    """Points of a mask, all without one; faint ones are transparent and not in the legend."""
     mask = np.ones(len(points), dtype=bool) if mask is None else mask
     for part, alpha in _by_opacity(mask, faint):
         name = label if alpha == 1.0 else ""
@@ -48,7 +48,7 @@ def draw_outliers(ax: Axes, scene: Scene, mask: Bools, size: float) -> None:
 
 
 def draw_rings(ax: Axes, scene: Scene, mask: Bools | None, size: float) -> None:
-    """Rings around the source points that the prediction has wrong."""
+    """Rings around the source points with wrong predictions."""
     if mask is not None and mask.any():
         points = scene.source[mask].T
         ax.plot(*points, ls="", marker="o", ms=size, mfc="none", mec=WRONG, mew=0.9, label="predicted wrong", zorder=4)
@@ -83,7 +83,7 @@ def draw_arrows(ax: Axes, scene: Scene, labels: Labels) -> None:
 
 
 def _speed_label(ax: Axes, scene: Scene, tip: Floats, velocity: Floats, color: str) -> None:
-    """Writes the speed at the arrow's tip, inside the picture even where the tip is not."""
+    """Writes the speed at the arrow's tip, moved into the picture if necessary."""
     low, high = scene.window
     place = np.clip((tip - low) / (high - low), 0.02, 0.95)
     side = "left" if place[0] < 0.15 else "right" if place[0] > 0.85 else "center"

@@ -1,10 +1,10 @@
-"""Figures of a pair: what became of every point, what moves together and how fast, beside the truth where it is known.
+"""Figures of a pair: associations, clusters and velocities of every point, beside the annotation if there is one.
 
 All positions are in the source sensor's frame (x ahead, y left, metres); target points are drawn at their own coordinates, so the
-line of an association also shows how far the sensor moved. Arrows show velocities relative to the world: for a mover with motion
+line of an association also shows the motion of the sensor. Arrows show velocities relative to the world: for a mover with motion
 T and the background's B, both `T_target_source`, its centroid c travels B^-1(T(c)) - c in `dt` seconds.
 
-Matplotlib is imported when a figure is made, not with this module, and pyplot never: no global state, no display.
+Matplotlib is imported when a figure is made, not with this module, and pyplot is not used: no global state, no display.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def plot_clusters(pair: ScanPair, predictions: Mapping[str, PairPrediction]) -> 
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: float = 130.0) -> None:
-    """Writes a PNG in one step (a temporary file beside it, then a rename); makes the folders above it.
+    """Writes a PNG atomically (a temporary file in the same folder, then a rename); creates missing folders.
 
     Raises:
         ValueError: `path` does not end in .png.
@@ -141,7 +141,7 @@ def _draw_scans(ax: Axes, scene: Scene) -> None:
 
 
 def _draw_registered(ax: Axes, scene: Scene, answer: Answer) -> None:
-    """Both scans in the target's frame: what is static coincides, what moves stands apart."""
+    """Both scans in the target's frame: static points coincide, movers are apart."""
     background = answer.labels.motion(BACKGROUND)
     draw_frame(ax, scene.window, "sensor's motion undone", f"source moved by the {answer.name} background motion")
     draw_dots(ax, scene.target, TARGET, "target scan", size=3.0)

@@ -1,4 +1,4 @@
-"""Where to look: what the panels of a figure share, the points, the windows onto them and the time that arrows stand for."""
+"""Common geometry of a figure's panels: points, windows onto them, and the time span of arrows."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torchcrf_scan.geometry.velocity import ground_velocity
 from torchcrf_scan.scan import BACKGROUND, Bools, Floats, Scan, ScanPair
 from torchcrf_scan.viz.answers import Labels
 
-HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # seconds of travel that an arrow may stand for
+HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # seconds of travel shown by an arrow
 
 Window = tuple[Floats, Floats]  # lower and upper corner, (2,) each
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What every panel of a figure shares; points are (n_beams, 2), NaN where a beam returned nothing."""
+    """Data shared by all panels of a figure; points are (n_beams, 2), NaN for beams without return."""
 
     source: Floats
     target: Floats
@@ -29,7 +29,7 @@ class Scene:
 
 
 def make_scene(pair: ScanPair, answers: list[Labels]) -> Scene:
-    """The common ground of all panels; `answers` in order of trust: the first that has a mover chooses the magnified view."""
+    """The scene of a figure; the first of `answers` with a mover determines the magnified view."""
     source, target = _beam_points(pair.source), _beam_points(pair.target)
     faint = np.zeros(len(source), dtype=bool) if pair.annotation is None else np.asarray(pair.annotation.ignore)
     centroids = [_centroid(source, labels.cluster == k) for labels in answers[:1] for k in labels.movers]
@@ -42,7 +42,7 @@ def make_scene(pair: ScanPair, answers: list[Labels]) -> Scene:
 
 
 def mover_velocities(source: Floats, dt: float, labels: Labels) -> dict[int, tuple[Floats, Floats]]:
-    """Mover -> its centroid and its velocity relative to the world in the source frame, (2,) each, where both are known."""
+    """Mover -> its centroid and its velocity relative to the world in the source frame, (2,) each, if both are known."""
     if not (np.isfinite(dt) and dt > 0.0):
         return {}
     background = labels.motion(BACKGROUND)
@@ -68,7 +68,7 @@ def _centroid(points: Floats, mask: Bools) -> Floats:
 
 
 def _robust_window(points: Floats, always: Floats) -> Window:
-    """Holds the sensor, 96 % of the points per axis and the `always` ones, with a margin; aspect between 0.85 and 1.4."""
+    """Contains the sensor, 96 % of the points per axis and the `always` ones, with a margin; aspect between 0.85 and 1.4."""
     points, always = points[np.isfinite(points).all(axis=-1)], always[np.isfinite(always).all(axis=-1)]
     bulk = np.percentile(points, (2, 98), axis=0) if len(points) else np.zeros((1, 2))
     corners = np.concatenate([bulk, always, np.zeros((1, 2))])
@@ -79,7 +79,7 @@ def _robust_window(points: Floats, always: Floats) -> Window:
 
 
 def _zoom_window(source: Floats, target: Floats, labels: Labels, window: Window) -> Window | None:
-    """A window of the same aspect around the largest mover and what it became, None where nothing moves."""
+    """A window of the same aspect around the largest mover in both scans, None if nothing moves."""
     sizes = {int(k): int((np.isfinite(source[:, 0]) & (labels.cluster == k)).sum()) for k in labels.movers}
     if not sizes or max(sizes.values()) == 0:
         return None
