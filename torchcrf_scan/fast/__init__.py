@@ -1,1 +1,1 @@
-"""The rounds of one pair as loops, from a start to the answer, without gradients."""
+"""The rounds of one pair as loops, from a start to the prediction, without gradients."""

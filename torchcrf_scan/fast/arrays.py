@@ -1,4 +1,4 @@
-"""Arrays and numbers that the rounds of one pair work on: fitted weights, settings, the pair's scene, the state and the answer."""
+"""Arrays and numbers of the rounds of one pair: fitted weights, settings, scene, state and result."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Fitted(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """The part of the configuration that the rounds use; `metric` is a place in `motion.METRICS`."""
+    """The settings used by the rounds; `metric` is an index of `motion.METRICS`."""
 
     candidates: int
     iterations: int
@@ -47,7 +47,7 @@ class Settings(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """The answer, metres; the attributes are those of `prediction.Prediction`.
+    """The result, metres; the attributes are those of `prediction.Prediction`.
 
     Attributes:
         association, cluster: (N,). motions: (C, 3). active: (C,). candidates: (N, K).
@@ -72,7 +72,7 @@ class Decoded(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """A pair in the unit that features are measured in, and what does not change from round to round.
+    """A pair in the features' unit of length, with the quantities that stay constant over the rounds.
 
     Attributes:
         factor: units in a metre. source: (N, 2), target: (M, 2). noise: of a return.

@@ -40,7 +40,7 @@ def stumps_of(ensemble: StumpEnsemble) -> Stumps:
 def margin(stumps: Stumps, f: int, value: float) -> float:
     """Margin of feature f: that between the thresholds below the value and the others."""
     row, place, length = stumps.thresholds[f], 0, stumps.finite[f]
-    while length > 0:  # no branch depends on the value: it could not be foretold
+    while length > 0:  # without branches on the value, which could not be predicted
         half = (length + 1) >> 1
         place += half * int(row[place + half - 1] < value)
         length -= half

@@ -25,7 +25,7 @@ def under_motions(source: Array, motions: Array, active: Booleans) -> tuple[Arra
 
 @kernel
 def _least_distance(moved: Array, i: int, x: float, y: float) -> float:
-    """Squared distance of a target point to source point i under the motion that brings it nearest. moved: (A, N, 2)."""
+    """Squared distance of a target point to source point i under the closest motion. moved: (A, N, 2)."""
     least = np.inf
     for a in range(len(moved)):
         dx, dy = moved[a, i, 0] - x, moved[a, i, 1] - y
@@ -35,7 +35,7 @@ def _least_distance(moved: Array, i: int, x: float, y: float) -> float:
 
 @kernel
 def _insert(distance: float, j: int, last: int, squared: Array, index: Integers) -> None:
-    """Puts a point in its place before `last`, which falls out of the list of the nearest: nearest and then first ones first."""
+    """Inserts a point before `last`, which is dropped from the list of the nearest, sorted by distance, then by index."""
     place = last
     while place > 0 and (squared[place - 1] > distance or (squared[place - 1] == distance and index[place - 1] > j)):
         squared[place], index[place] = squared[place - 1], index[place - 1]
@@ -80,7 +80,7 @@ def _improve(boxes: Boxes, moved: Array, i: int, member: Integers, squared: Arra
 
 @kernel
 def sort_in_place(index: Integers) -> None:
-    """Ascending; for a few numbers."""
+    """Sorts in ascending order; for a few numbers."""
     for k in range(1, len(index)):
         value, place = index[k], k
         while place > 0 and index[place - 1] > value:
@@ -105,14 +105,14 @@ def nearest_under(boxes: Boxes, moved: Array, which: Integers, C: int) -> Intege
 
 @entry
 def by_motion(boxes: Boxes, source: Array, motions: Array, active: Booleans, count: int) -> tuple[Integers, Booleans, Integers]:
-    """The `count` target points that come nearest under any active motion; all of them when count is 0 (dense).
+    """The `count` nearest target points under any active motion; all of them when count is 0 (dense).
 
     Args:
         boxes: of M target points. source: (N, 2); motions: (C, 3); active: (C,) bool.
-        count: K. Of points at the same distance the first ones are taken.
+        count: K. Ties go to the first points.
 
     Returns:
-        index (N, K), ascending; mask (N, K), all true but without an active motion; nearest (N, C), see `nearest_under`.
+        index (N, K), ascending; mask (N, K), all true unless no motion is active; nearest (N, C), see `nearest_under`.
     """
     N, M = len(source), len(boxes.points)
     moved, which = under_motions(source, motions, active)
@@ -125,7 +125,7 @@ def by_motion(boxes: Boxes, source: Array, motions: Array, active: Booleans, cou
         return index, mask, nearest_under(boxes, moved, which, len(active))
     closest, guess = np.zeros((N, len(active)), np.int64), np.zeros(A, np.int64)
     squared, member = np.empty(K), np.full(M, -1)
-    for i in range(N):  # the candidates of the point before, or those after them, are a good guess at the list
+    for i in range(N):  # the candidates of the point before, or those after them, are good guesses
         step = 1 if i > 0 and index[i - 1, K - 1] < M - 1 else 0
         for k in range(K):
             j = index[i - 1, k] + step if i > 0 else k
@@ -141,7 +141,7 @@ def by_motion(boxes: Boxes, source: Array, motions: Array, active: Booleans, cou
 
 @entry
 def with_targets(index: Integers, mask: Booleans, association: Integers) -> tuple[Integers, Booleans, Integers]:
-    """Adds a given target to every point's candidates, in place of the last, and finds it there.
+    """Adds a given target to every point's candidates, replacing the last if it is missing, and returns its position.
 
     Args:
         index, mask: (N, K). association: (N,), -1 outlier.

@@ -1,4 +1,4 @@
-"""Which engine runs the rounds: the loops (`torchcrf_scan.fast`), or the same in tensors (`torchcrf_scan.inference`)."""
+"""Choice of the engine of the rounds: the loops (`torchcrf_scan.fast`), or tensors (`torchcrf_scan.inference`)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torchcrf_scan.config import ModelConfig
 
 
 def can_run(backend: str, device: torch.device) -> bool:
-    """Whether loops may take the place of tensors that have no gradient, on a device.
+    """Whether loops can replace tensors without gradient on a device.
 
     Raises:
         ValueError: `backend` is `compiled`, and they cannot.
@@ -37,7 +37,7 @@ def can_decode(model: ModelConfig, device: torch.device, *, needs_gradient: bool
 
 
 def _why_not_here(device: torch.device) -> str | None:
-    """What the loops need, where they cannot run; else None."""
+    """The reason why loops cannot run on a device, or None."""
     if torch.compiler.is_compiling():
         return "an ordinary call, not a compiled or exported one"
     return f"scans on the CPU, got {device}" if device.type != "cpu" else None

@@ -1,7 +1,7 @@
 """The clustering chain of one pair: potentials without feature tensors, and an exact pass.
 
 The potentials are those of `features.clustering`, `features.extension` and `features.potentials`; the weights are applied on the
-fly, and only clusters that exist cost anything.
+fly, and the cost is that of the existing clusters only.
 """
 
 from __future__ import annotations
@@ -79,10 +79,10 @@ class Tables(NamedTuple):
 
     Attributes:
         moved: (C, N, 2) source points under every motion.
-        residual: (C, N) distance to the associated target point, or to the nearest for an outlier; inf of a cluster that is not.
+        residual: (C, N) distance to the associated target point, or to the nearest for an outlier; inf for inactive clusters.
         log_inlier: (C, N) node potentials of the clusters, -inf where impossible.
-        log_outlier: (N,) those of the outlier, but for the weight on no cluster coming near.
-        length: (N-1,) of the edges. same, different: (N-1,) edge potentials of one cluster and of two, but for their parting.
+        log_outlier: (N,) those of the outlier, without the term for unexplained points (C2).
+        length: (N-1,) of the edges. same, different: (N-1,) edge potentials of one cluster and of two, the latter without Q7.
     """
 
     moved: Array
@@ -96,7 +96,7 @@ class Tables(NamedTuple):
 
 @kernel
 def distance(dx: float, dy: float) -> float:
-    """Length of a vector; `hypot` guards against overflow, which takes several times as long."""
+    """Length of a vector; without the overflow guards of `hypot`, which take several times as long."""
     return math.sqrt(dx * dx + dy * dy)
 
 
@@ -229,7 +229,7 @@ def tabulate(
     Args:
         source: (N, 2); target: (M, 2), and their sweeps.
         motions: (C, 3). active: (C,) clusters that exist, the background among them.
-        reach: (N, C) clusters that a point is near enough to.
+        reach: (N, C) clusters within reach of a point.
         association: (N,), -1 outlier. nearest_target: (N, C) nearest target point, of outliers at least.
     """
     N, C = len(source), len(motions)
@@ -265,7 +265,7 @@ def node_potentials(tables: Tables, states: Integers, model: ClusteringModel) ->
 
 @kernel
 def transition_potentials(tables: Tables, states: Integers, log_unary: Array, model: ClusteringModel) -> Array:
-    """(N-1, P + 1, P + 1) from every state to every state of the next point; finite. log_unary: as `node_potentials` gives it."""
+    """(N-1, P + 1, P + 1) from every state to every state of the next point; finite. log_unary: output of `node_potentials`."""
     P, w = len(states), model.weights
     log_pairwise = np.empty((len(tables.length), P + 1, P + 1))
     for i in range(len(tables.length)):

@@ -1,6 +1,6 @@
-"""Algorithm 1 in blocks for one pair, from the start to the answer; `inference.joint.decode` without batches.
+"""Algorithm 1 in blocks for one pair, from the start to the prediction; `inference.joint.decode` without batches.
 
-For the settings that `fast.choice` lists. All rounds of a pair are one call of machine code, so that other threads can run
+For the settings supported by `fast.choice`. All rounds of a pair are one call of machine code, so that other threads can run
 meanwhile.
 """
 
@@ -29,7 +29,7 @@ from torchcrf_scan.loops.shape import describe, resolution
 
 @kernel
 def scaled(points: Array, factor: float) -> Array:
-    """(P, 2) in another unit of length; a loop, for array expressions take long to compile."""
+    """(P, 2) in another unit of length; a loop, as array expressions take long to compile."""
     changed = np.empty_like(points)
     for i in range(len(points)):
         changed[i, 0], changed[i, 1] = points[i, 0] * factor, points[i, 1] * factor
@@ -89,7 +89,7 @@ def first_state(scene: Scene, start: PairStart, is_chosen: bool, settings: Setti
 
 
 def first_beliefs(scene: Scene, state: State, count: int) -> State:
-    """The state with the labels of a start as beliefs, the answer without any rounds. count: K."""
+    """The state with the labels of a start as beliefs, the result of zero rounds. count: K."""
     found, mask, _ = by_motion(scene.boxes, scene.source, state.motions, state.active, count)
     candidates, _, place = with_targets(found, mask, state.association)
     C = len(state.motions)
@@ -108,7 +108,7 @@ def first_beliefs(scene: Scene, state: State, count: int) -> State:
 
 @kernel
 def mean_gap(source: Array, a: Array, b: Array, labels: Integers, c: int) -> float:
-    """How far two motions (3,) take the points with label c apart, on average. source: (N, 2); labels: (N,)."""
+    """Mean distance of the points with label c under two motions (3,). source: (N, 2); labels: (N,)."""
     one, other = transform_of(a), transform_of(b)
     total, count = 0.0, 0
     for i in range(len(labels)):
@@ -119,14 +119,14 @@ def mean_gap(source: Array, a: Array, b: Array, labels: Integers, c: int) -> flo
 
 @kernel
 def add_logs(a: float, b: float) -> float:
-    """log(exp a + exp b); impossible where both are."""
+    """log(exp a + exp b); -inf if both are."""
     high, low = max(a, b), min(a, b)
     return high + math.log1p(math.exp(low - high)) if high > -np.inf else high
 
 
 @kernel
 def join(state: State, low: int, high: int) -> None:
-    """Gives cluster `high` to `low`, in place."""
+    """Merges cluster `high` into `low`, in place."""
     for i in range(len(state.cluster)):
         if state.cluster[i] == high:
             state.cluster[i] = low
@@ -137,7 +137,7 @@ def join(state: State, low: int, high: int) -> None:
 
 @entry
 def merge_alike(source: Array, state: State, scale: float) -> None:
-    """Clusters that turn out to be one become the one with the lower number, in place; `inference.joint.merge_alike`."""
+    """Merges clusters of equal motion into the one with the lower number, in place; `inference.joint.merge_alike`."""
     C = len(state.motions)
     labels, active = state.cluster.copy(), state.active.copy()
     count = np.zeros(C, np.int64)
@@ -159,7 +159,7 @@ def merge_alike(source: Array, state: State, scale: float) -> None:
 def iterate(
     scene: Scene, state: State, start: PairStart, is_chosen: bool, fitted: Fitted, settings: Settings
 ) -> tuple[State, bool, int]:
-    """The rounds: the last state, whether it has settled, and how many there were."""
+    """The rounds: the last state, whether it has converged, and the number of rounds."""
     tables = tables_of(scene, state, fitted.clustering)
     state.cluster[:] = nearest_clusters(tables, scene.reach, state.association)
     kept = kept_of(len(scene.source), len(scene.target), len(state.motions), settings.candidates)
@@ -184,7 +184,7 @@ def iterate(
 
 @entry
 def read_out(scene: Scene, state: State, converged: bool, iterations: int, fitted: Fitted, settings: Settings) -> Decoded:
-    """The answer in metres, with covariances and confidences."""
+    """The result in metres, with covariances and confidences."""
     covariance, information, directions = motion_covariance(
         scene.source,
         scene.target,
@@ -236,7 +236,7 @@ def decode_pair(pair: Pair, start: PairStart, outlier: Array, moving: Array, fit
 
 
 def decode_nothing(pair: Pair, start: PairStart, outlier: Array, moving: Array, fitted: Fitted, settings: Settings) -> Decoded:
-    """The answer where a scan is empty: outliers, and the motions of the start with the covariances of the prior."""
+    """The result if a scan is empty: outliers, and the motions of the start with the covariances of the prior."""
     N, C = len(pair.source), len(start.motions)
     outliers = np.full(N, -1)
     candidates = np.zeros((N, 1), np.int64)

@@ -50,7 +50,7 @@ def beam_after(sweep: Sweep, dx: float, dy: float) -> tuple[float, int]:
 
 @kernel
 def look(sweep: Sweep, x: float, y: float) -> tuple[float, float]:
-    """Free-space test of a point: how far it is seen through and how far hidden, each from 0 (not) to 1 (clearly)."""
+    """Free-space test of a point: degrees to which it is seen through and hidden, each from 0 to 1."""
     N = len(sweep.ranges)
     if N == 0:
         return 0.0, 0.0

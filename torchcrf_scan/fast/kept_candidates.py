@@ -1,7 +1,7 @@
-"""Candidates kept from round to round: a list of the nearest stays exactly what it is while the motions change little.
+"""Cached candidates: a point's list of nearest targets is provably unchanged while its motions change little.
 
-A motion that takes a point d further changes none of its distances by more than d. So the K nearest targets are the same ones until
-some motion of the point has changed by half of what the next target was further away than the last in the list.
+A motion that displaces a point by d changes none of its distances by more than d. So the K nearest targets stay the same until
+some motion of the point has displaced it by half the gap between the last target in the list and the next one.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from torchcrf_scan.fast.candidates import by_motion
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.nearest import Boxes
 
-ROUNDING = 1e-9  # of the unit of features: a change of distance that is none
+ROUNDING = 1e-9  # of the unit of features: smaller changes of distance are rounding errors
 
 
 class Kept(NamedTuple):
-    """Candidates kept from round to round, brought up to date by `update`; answers do not depend on them.
+    """Candidates cached between rounds, updated by `update`; results do not depend on the cache.
 
     Attributes:
-        index: (N, K) candidates, ascending. lead: (N,) by which the next target was further away, -1 at first.
-        moved: (C, N, 2) where the points were when their lists were made. active: (C,) motions that there were then.
+        index: (N, K) candidates, ascending. lead: (N,) gap to the next target, -1 at first.
+        moved: (C, N, 2) the moved points when their lists were made. active: (C,) the active motions then.
     """
 
     index: Integers  # type: ignore[assignment]  # hides a method of tuples
@@ -34,7 +34,7 @@ class Kept(NamedTuple):
 
 @kernel
 def kept_of(points: int, targets: int, clusters: int, count: int) -> Kept:
-    """An empty one for N points, M targets, C clusters and K candidates, 0 for all targets."""
+    """An empty cache for N points, M targets, C clusters and K candidates, 0 for all targets."""
     K = count if 0 < count < targets else targets
     lead = np.full(points, -1.0)
     return Kept(np.empty((points, K), np.int64), lead, np.empty((clusters, points, 2)), np.zeros(clusters, np.bool_))
@@ -70,7 +70,7 @@ def keep_nearest(kept: Kept, i: int, longer: Integers, boxes: Boxes, moved: Arra
         for c in range(len(active)):
             if active[c]:
                 least = min(least, (moved[c, i, 0] - x) ** 2 + (moved[c, i, 1] - y) ** 2)
-        if least >= worst:  # of two as far the first one stays
+        if least >= worst:  # ties go to the first one
             worst, last, second = least, k, worst
         else:
             second = max(second, least)

@@ -71,7 +71,7 @@ def largest_spread(points: Array) -> float:
 def line_step(members: Members, start: Array, scale: float) -> Array:
     """(3,) one robust point-to-line step from a motion (3,); `inference.motion.line_fit` of one cluster.
 
-    scale: residual at which a point's weight has fallen to a half.
+    scale: residual at which a robust weight is one half.
     """
     partner, tangent, pairs = members.partner, members.tangent, np.empty((PAIR_ROWS, len(members.points)))
     apply_to_rows(start, members.points, pairs)
@@ -102,12 +102,12 @@ def estimate(
     scale: float,
     min_extent: float,
 ) -> Array:
-    """(C, 3) motions from the labels, with the rules for small clusters; those of clusters that do not exist stay.
+    """(C, 3) motions from the labels, with the rules for small clusters; those of inactive clusters are unchanged.
 
     Args:
         source: (N, 2); target, tangents: (M, 2); association, cluster: (N,), -1 outlier.
-        motions: (C, 3) to begin with. active: (C,) clusters that exist. metric: POINT, LINE or GIVEN.
-        scale: residual at which a robust weight has fallen to a half. min_extent: a smaller cluster takes the background's turn.
+        motions: (C, 3) initial. active: (C,) clusters that exist. metric: POINT, LINE or GIVEN.
+        scale: residual at which a robust weight is one half. min_extent: a smaller cluster takes the background's rotation.
     """
     fitted = motions.copy()
     if metric == GIVEN:
@@ -128,7 +128,7 @@ def estimate(
 
 @kernel
 def count_points(association: Integers, cluster: Integers, clusters: int) -> Integers:
-    """(C,) points with that label and a partner. association, cluster: (N,), -1 outlier."""
+    """(C,) number of associated points of every cluster. association, cluster: (N,), -1 outlier."""
     count = np.zeros(clusters, np.int64)
     for i in range(len(cluster)):
         if cluster[i] >= 0 and association[i] >= 0:
@@ -138,7 +138,7 @@ def count_points(association: Integers, cluster: Integers, clusters: int) -> Int
 
 @kernel
 def retire_empty(active: Booleans, empty_for: Integers, count: Integers) -> None:
-    """Ends a round, in place: clusters without a point for two rounds are removed, the background never. All (C,)."""
+    """Ends a round, in place: removes clusters (never the background) that had no point for two rounds. All (C,)."""
     for c in range(len(active)):
         empty_for[c] = 0 if count[c] > 0 else empty_for[c] + 1
         active[c] = c == 0 or (active[c] and empty_for[c] < PATIENCE)

@@ -1,4 +1,4 @@
-"""The rounds of whole pairs, one thread for every pair, without gradients: from the start to the answer."""
+"""The rounds of whole pairs, one thread per pair, without gradients: from the start to the prediction."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from torchcrf_scan.search.pairs import start_arrays
 
 
 class Extra(NamedTuple):
-    """(N,) log potentials of `features.learned.ExtraLogUnary` for one pair, 0 where there is nothing extra."""
+    """(N,) log potentials of `features.learned.ExtraLogUnary` for one pair, 0 without learned inputs."""
 
     outlier: Array
     moving: Array
@@ -52,13 +52,13 @@ def predict(batch: ScanPairBatch, start: Start, fitted: Fitted, settings: Settin
 
 
 def extras_of(points: Sequence[int], inputs: LearnedInputs | None) -> list[Extra]:
-    """The log potentials of pairs with so many source points."""
+    """The log potentials of pairs with the given numbers of source points."""
     given = (None, None) if inputs is None else (inputs.outlier, inputs.moving)
     return [Extra(*(np.zeros(n) if of is None else array_of(of[b, :n]) for of in given)) for b, n in enumerate(points)]
 
 
 def prediction_of(answers: Sequence[Decoded], batch: ScanPairBatch) -> Prediction:
-    """The answers of all pairs of a batch as padded tensors; padding is outliers, of which nothing is known."""
+    """The results of all pairs of a batch as padded tensors; padding is labelled as outliers, with uniform log-beliefs."""
     N, like = batch.source.shape[1], batch.source
     K = max(answer.candidates.shape[1] for answer in answers)
     D = answers[0].log_cluster.shape[1]
@@ -87,7 +87,7 @@ def prediction_of(answers: Sequence[Decoded], batch: ScanPairBatch) -> Predictio
 
 
 def by_beam(answer: Decoded, pair: ScanPair) -> PairPrediction:
-    """The answer for one pair by beam."""
+    """The prediction of one pair by beam."""
     uncertainty = Uncertainty(
         *(torch.from_numpy(part)[None] for part in (answer.covariance, answer.information, answer.directions))
     )

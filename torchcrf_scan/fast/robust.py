@@ -15,5 +15,5 @@ def robust_square(error: float, per_scale: float) -> float:
 
 @kernel
 def robust_weight(squared: float, scale: float) -> float:
-    """Weight of a squared residual, 1 at 0 and a half at the residual `scale`."""
+    """Weight of a squared residual: 1 at 0, one half at the residual `scale`."""
     return 1 / (1 + squared / scale**2)

@@ -43,7 +43,7 @@ def tables_of(scene: Scene, state: State, model: ClusteringModel) -> Tables:
 
 @kernel
 def nearest_clusters(tables: Tables, reach: Booleans, association: Integers) -> Integers:
-    """(N,) cluster in whose reach (N, C) a point is and whose motion takes it nearest to its partner; -1 without a partner."""
+    """(N,) cluster within reach (N, C) whose motion takes a point nearest to its partner; -1 without a partner."""
     labels = np.empty(len(association), np.int64)
     for i in range(len(labels)):
         least, best = np.inf, 0
@@ -111,7 +111,7 @@ def same_labels(a: State, b: State) -> bool:
 
 @kernel
 def damp(after: State, before: State, older: State) -> None:
-    """Halves the motions' step, in place, where the labels have come back to those of two rounds ago."""
+    """Halves the motions' step, in place, if the labels equal those of two rounds ago."""
     if not same_labels(after, older) or same_labels(after, before):
         return
     for c in range(len(after.motions)):

@@ -32,9 +32,9 @@ def worth_of(parameters: Parameters) -> Worth:
 
 @kernel
 def evidence(tables: Tables, active: Booleans, model: ClusteringModel) -> Array:
-    """(C,) log Z of the clustering chain, minus that without the cluster; 0 of the background and of clusters that are absent.
+    """(C,) log Z of the clustering chain, minus that without the cluster; 0 for the background and for inactive clusters.
 
-    Without it, its points still count as explained, else its absence would speak for them being outliers.
+    The removed cluster's points still count as explained; otherwise its removal would favour the outlier state there.
 
     Args:
         tables: at the present motions and associations. active: (C,) clusters that exist.

@@ -1,4 +1,4 @@
-"""Association features that do not depend on the motions (L1..L11 and their boosters), kept from round to round.
+"""Association features independent of the motions (L1..L11 and their boosters), cached between rounds.
 
 `features.association` for one pair, with the weights applied at once.
 """
@@ -19,10 +19,10 @@ from torchcrf_scan.loops.rigid import apply
 from torchcrf_scan.loops.shape import Shape
 from torchcrf_scan.names import SHAPE_CHANNELS, STATIC_CHANNELS
 
-RADIUS = SHAPE_CHANNELS  # the channels follow each other: L1..L9, the radius, the translation
+RADIUS = SHAPE_CHANNELS  # order of the channels: L1..L9, the radius, the translation
 LENGTHS = 12  # to three neighbours on either side, straight and along the scan
 DESCRIPTORS = 18  # numbers kept of a point: the lengths, three angles, the radius, x and y
-TOGETHER = 256  # pairs of points whose features are computed at once: few enough to stay in the fastest cache
+TOGETHER = 256  # pairs of points processed at once: few enough for the fastest cache
 
 
 class AssociationModel(NamedTuple):
@@ -70,10 +70,10 @@ class AssociationPair(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Static scores kept from round to round, brought up to date by `associate`; answers do not depend on it.
+    """Static scores cached between rounds, updated by `associate`; results do not depend on the cache.
 
     Attributes:
-        is_known: (N,) whether the rest is there. candidates, mask: (N, K) what it is of.
+        is_known: (N,) valid entries. candidates, mask: (N, K) for which they were computed.
         score: (N, K) weighted sum of the static channels. margin: (N, K) data booster of them.
         outlier_margin: (N,) outlier booster of the best of every static channel.
     """
@@ -159,9 +159,9 @@ def _differences(pair: AssociationPair, work: Workspace, points: Integers) -> Ar
 
 @kernel
 def _best_of_points(channels: Array, mask: Booleans, points: Integers) -> Array:
-    """(11, R) the best of every channel over the real candidates; the worst there is without one. channels: (11, R K)."""
+    """(11, R) the best of every channel over the real candidates, -kappa without one. channels: (11, R K)."""
     K = mask.shape[1]
-    best = np.full((STATIC_CHANNELS, len(points)), -KAPPA)  # which no channel is below
+    best = np.full((STATIC_CHANNELS, len(points)), -KAPPA)  # lower bound of all channels
     for c in range(STATIC_CHANNELS):
         for r in range(len(points)):
             row = channels[c, r * K : (r + 1) * K]
@@ -202,7 +202,7 @@ def _has_changed(i: int, index: Integers, mask: Booleans, work: Workspace) -> bo
 
 @kernel
 def update_static(model: AssociationModel, pair: AssociationPair, work: Workspace, index: Integers, mask: Booleans) -> None:
-    """Brings the workspace up to date with the candidates (N, K)."""
+    """Updates the workspace for the candidates (N, K)."""
     N, K = index.shape
     block = max(TOGETHER // max(K, 1), 1)
     points, R = np.empty(block, np.int64), 0

@@ -35,9 +35,9 @@ class Fit(NamedTuple):
 
 @kernel
 def surface_tangents(points: Array, mask: Booleans, noise: float) -> tuple[Array, Booleans]:
-    """(N, 2) direction of the surface at every point, from a stretch long beside the noise, and (N,) where there is one.
+    """(N, 2) direction of the surface at every point, from a stretch long compared with the noise, and (N,) whether it is defined.
 
-    points: (N, 2) in beam order. mask: (N,) points that count.
+    points: (N, 2) in beam order. mask: (N,) points to use.
     """
     N = len(points)
     tangent, is_found = np.zeros((N, 2)), np.zeros(N, np.bool_)
@@ -76,7 +76,7 @@ def surface_tangents(points: Array, mask: Booleans, noise: float) -> tuple[Array
 def linearise(
     members: Members, places: Integers, motion: Array, metric: int, scale: float, noise: float, tangent: Array, is_found: Booleans
 ) -> Fit:
-    """A cluster's fit at its motion. tangent, is_found: of all source points, as `surface_tangents` gives them."""
+    """A cluster's fit at its motion. tangent, is_found: of all source points, output of `surface_tangents`."""
     P = len(places)
     by = transform_of(motion)
     weights, residual, arm, centre = np.ones(P), np.empty((P, 2)), np.empty((P, 2)), np.zeros(2)
@@ -116,7 +116,7 @@ def linearise(
 
 @kernel
 def shared_scores(score: Array, places: Integers) -> Array:
-    """(3, 3) mean over all ways to cut the scan into runs of `RUN` of the sum of the runs' squared scores.
+    """(3, 3) sum of the squared scores of runs of `RUN` points, averaged over all offsets of the runs.
 
     score: (P, 3) of the points at places (P,), ascending.
     """
@@ -199,7 +199,7 @@ def score_covariance(sums: Sums, places: Integers) -> Array:
 
 @kernel
 def projection_on(information: Array, directions: Array) -> Array:
-    """(3, 3) projection on the directions (3, 3), a row each, whose information (3,) is large enough to count."""
+    """(3, 3) projection on the directions (3, 3), a row each, of sufficient information (3,)."""
     keep = np.zeros((3, 3))
     for k in range(3):
         if information[k] >= LEAST_SHARE:
@@ -225,7 +225,7 @@ def cluster_covariance(
         for d in range(3):
             normal[r, d] /= total
     information, directions = axes_of(normal)
-    if metric != POINT:  # information that the tangents' noise and the steps along the surface only pretend
+    if metric != POINT:  # without information due to the tangents' noise and to steps along the surface
         for r in range(3):
             normal[r, r] -= LEAST_SHARE
     keep = projection_on(information, directions)
@@ -270,7 +270,7 @@ def motion_covariance(
 
     Args:
         source: (N, 2) in beam order; target, tangents: (M, 2); association, cluster: (N,), -1 outlier, of the last fit.
-        metric: POINT, else point-to-line. scale: residual at which a robust weight has fallen to a half.
+        metric: POINT, else point-to-line. scale: residual at which a robust weight is one half.
         noise: standard deviation of a return. Both in the unit of the points.
     """
     N, C = len(source), len(motions)
@@ -295,7 +295,7 @@ def motion_covariance(
 
 @kernel
 def confidence(yes: float, no: float, calibration: Array) -> float:
-    """Calibrated probability of a statement with beliefs `yes` and `no`. calibration: (2,) slope and offset."""
+    """Calibrated probability of a label with belief `yes` against `no`. calibration: (2,) slope and offset."""
     return 1 / (1 + math.exp(-(calibration[0] * (math.log(yes) - math.log(no)) + calibration[1])))
 
 

@@ -1,1 +1,1 @@
-"""Kernels on numbers and arrays that know nothing of features: machine code, angles, motions, nearest points, chains."""
+"""Kernels on numbers and arrays, independent of features: machine code, angles, motions, nearest points, chains."""

@@ -1,4 +1,4 @@
-"""Angles on a circle and places on a rising scale of bearings."""
+"""Angles on a circle, and positions on a rising scale of bearings."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import numpy as np
 
 from torchcrf_scan.loops.jit import Array, kernel
 
-BACKWARDS = 1e-4  # radians; a step back by so little is no turn
+BACKWARDS = 1e-4  # radians; smaller steps back are rounding errors
 
 
 @kernel
 def rising_turn(difference: float) -> float:
-    """Counter-clockwise angle in [0, 2 pi); a step back by rounding is no turn."""
+    """Counter-clockwise angle in [0, 2 pi); steps back within rounding error count as 0."""
     return max((difference + BACKWARDS) % (2 * math.pi) - BACKWARDS, 0.0)
 
 
 @kernel
 def turn_apart(difference: float) -> float:
-    """`rising_turn` without a division where there are no whole turns to take off; not to the last digit."""
+    """`rising_turn` without a division if there are no whole turns to subtract; not exact to the last digit."""
     return max(difference, 0.0) if -BACKWARDS <= difference < 6.0 else rising_turn(difference)
 
 
 @kernel
 def within_circle(angle: float) -> float:
-    """angle % (2 pi), which it seldom takes a division for."""
+    """angle % (2 pi), mostly without a division."""
     if angle < 0:
         angle += 2 * math.pi
     return angle if 0 <= angle < 2 * math.pi else angle % (2 * math.pi)
@@ -59,7 +59,7 @@ def polar(points: Array, origin: Array) -> tuple[Array, Array]:
 
 @kernel
 def first_from(rising: Array, value: float) -> int:
-    """Index of the first entry that is not below the value; their number where all are."""
+    """Index of the first entry that is not below the value; the number of entries if all are."""
     low, count = 0, len(rising)
     while count > 0:
         half = count // 2

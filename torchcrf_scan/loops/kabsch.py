@@ -9,7 +9,7 @@ import numpy as np
 from torchcrf_scan.loops.jit import Array, kernel
 from torchcrf_scan.loops.rigid import motion_onto
 
-ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of a sum of products: a spread this small is rounding noise
+ROUNDING = 8 * float(np.finfo(np.float64).eps)  # of a sum of products: a smaller spread is rounding noise
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""The lower median, which is `torch.median`."""
+"""The lower median, as in `torch.median`."""
 
 from __future__ import annotations
 

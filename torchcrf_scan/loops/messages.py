@@ -8,15 +8,15 @@ import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 
-WIDEST = 300.0  # potentials of a node and an edge differ by no more: then sums of exp of them stay numbers,
-SMALL = 1e-20  # if they are scaled up from here on
-LOWEST = -700.0  # exp of less is 0
-T2, T3, T4, T5, T6, T7, T8, T9, T10, T11, T12 = (1 / math.factorial(k) for k in range(2, 13))  # Taylor's of exp
+WIDEST = 300.0  # bound on the differences of a node's and an edge's potentials, within which sums of exp stay in range
+SMALL = 1e-20  # if they are rescaled below this
+LOWEST = -700.0  # exp of less is treated as 0
+T2, T3, T4, T5, T6, T7, T8, T9, T10, T11, T12 = (1 / math.factorial(k) for k in range(2, 13))  # Taylor series of exp
 
 
 @kernel
 def possible_states(log_unary: Array) -> Integers:
-    """States of (N, S) potentials that some node may have, ascending."""
+    """States of (N, S) potentials that are possible at some node, ascending."""
     N, S = log_unary.shape
     states, count = np.empty(S, np.int64), 0
     for s in range(S):
@@ -72,7 +72,7 @@ def forward_scores(log_unary: Array, log_pairwise: Array) -> Array:
 
 @kernel
 def _largest_sum(a: Array, b: Array) -> float:
-    """max of a + b; in four strands, as one would wait for itself."""
+    """max of a + b; in four independent strands, to hide the latency of a comparison."""
     S = len(a)
     x = y = z = w = -np.inf
     whole = S - S % 4
@@ -86,7 +86,7 @@ def _largest_sum(a: Array, b: Array) -> float:
 
 @kernel
 def exp_below(x: float) -> float:
-    """exp of x <= 0 to 1e-13 of its value, 0 below -700: as the library's, but several at once in a loop."""
+    """exp of x <= 0 to a relative error of 1e-13, 0 below -700: as the library's, but vectorised in a loop."""
     whole = np.floor(max(x, LOWEST) / math.log(2) + 0.5)
     r = max(x, LOWEST) - whole * math.log(2)  # within 0.35
     value = T8 + r * (T9 + r * (T10 + r * (T11 + r * T12)))
@@ -97,7 +97,7 @@ def exp_below(x: float) -> float:
 
 @kernel
 def log_softmax(row: Array) -> None:
-    """In place; impossible everywhere stays so. row: (S,)."""
+    """In place; a row of -inf alone is unchanged. row: (S,)."""
     peak = -np.inf
     for s in range(len(row)):
         peak = max(peak, row[s])
@@ -130,7 +130,7 @@ def _max_marginals(log_unary: Array, log_pairwise: Array) -> Array:
 
 @kernel
 def max_marginals(log_unary: Array, log_pairwise: Array) -> Array:
-    """Normalised log max-marginals (N, S): `chain_beliefs` at temperature 0. States that no node may have cost nothing.
+    """Normalised log max-marginals (N, S): `chain_beliefs` at temperature 0. States that are impossible at all nodes cost nothing.
 
     Args:
         log_unary: (N, S). log_pairwise: (N-1, S, S), row = state of node i, column = state of node i + 1. Either may hold -inf.
@@ -151,7 +151,7 @@ def max_marginals(log_unary: Array, log_pairwise: Array) -> Array:
 
 @kernel
 def _extent(row: Array) -> tuple[float, float]:
-    """Least and largest; in four strands, as one would wait for itself. row: (P,)."""
+    """Least and largest; in four independent strands, to hide the latency of a comparison. row: (P,)."""
     a = b = c = d = np.inf
     x = y = z = w = -np.inf
     whole = len(row) - len(row) % 4
@@ -165,10 +165,10 @@ def _extent(row: Array) -> tuple[float, float]:
 
 @kernel
 def _tables(log_unary: Array, log_pairwise: Array) -> tuple[Array, Array, float, bool]:
-    """exp(value - largest) of every node (N, S) and edge (N-1, S, S), the sum of the largest, and whether numbers will do.
+    """exp(value - largest) of every node (N, S) and edge (N-1, S, S), the sum of the largest, and whether sums stay in range.
 
-    They will if no state of a node can become less than exp(-WIDEST) of another: impossible nodes can be left out, but an edge that
-    is impossible here may make possible later what was too little to be kept.
+    They do if no state of a node can become less than exp(-WIDEST) of another: impossible nodes can be left out, but an impossible
+    edge may leave only states whose sums have already underflowed.
     """
     N, S = log_unary.shape
     nodes, edges = np.empty((N, S)), np.empty((max(N - 1, 0), S, S))
@@ -196,7 +196,7 @@ def _tables(log_unary: Array, log_pairwise: Array) -> tuple[Array, Array, float,
 
 @kernel
 def _advance(sums: Array, edge: Array, node: Array, keep: Array, after: Array) -> float:
-    """Makes sums those of the next node, four states at a time. Returns the largest.
+    """Advances the sums to the next node, four states at a time. Returns the largest.
 
     sums, node: (S,); edge: (S, S); keep: (S,) 0 for a state that is left out, else 1; after: (S,) scratch.
     """
@@ -225,7 +225,7 @@ def _advance(sums: Array, edge: Array, node: Array, keep: Array, after: Array) -
 
 @kernel
 def _log_totals(log_unary: Array, log_pairwise: Array, without: Integers) -> Array:
-    """(R,) log Z by logarithms throughout: always right, and slow. without: (R,) states to leave out, -1 for none."""
+    """(R,) log Z in the log domain throughout: always accurate, but slow. without: (R,) states to leave out, -1 for none."""
     N, S = log_unary.shape
     totals = np.empty(len(without))
     before, after, terms = np.empty(S), np.empty(S), np.empty(S)
@@ -243,7 +243,7 @@ def _log_totals(log_unary: Array, log_pairwise: Array, without: Integers) -> Arr
 
 @kernel
 def log_sum(terms: Array) -> float:
-    """logsumexp; -inf where nothing is possible. terms: (S,)."""
+    """logsumexp; -inf if all terms are. terms: (S,)."""
     peak = -np.inf
     for s in range(len(terms)):
         peak = max(peak, terms[s])

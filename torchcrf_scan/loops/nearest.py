@@ -1,6 +1,6 @@
-"""Nearest points of a scan, exactly: boxes round runs of neighbouring beams, and boxes round runs of boxes.
+"""Exact nearest points of a scan: boxes round runs of neighbouring beams, and boxes round runs of boxes.
 
-Neighbouring beams mostly meet the same surface, so that their order is as good as a tree's and costs nothing to build.
+Neighbouring beams mostly meet the same surface, so their order serves as well as a tree and costs nothing to build.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ RUN = 8  # points in a box, and boxes in a large box
 
 
 class Boxes(NamedTuple):
-    """P points in order and what they lie in.
+    """P points in beam order with two levels of bounding boxes.
 
     Attributes:
         points: (P, 2).
@@ -56,9 +56,9 @@ def box_distance(box: Array, x: float, y: float) -> float:
 
 @kernel
 def nearest_within(boxes: Boxes, x: float, y: float, guess: int, least: float) -> tuple[float, int]:
-    """Squared distance to and index of the nearest point that is nearer than the root of `least`, -1 where there is none.
+    """Squared distance to and index of the nearest point that is nearer than the root of `least`, -1 if there is none.
 
-    Of points at the same distance the first. `guess` is tried first, -1: none; good guesses make the search fast.
+    Ties go to the first point. `guess` is tried first, -1: none; good guesses make the search fast.
     """
     points, small, large = boxes
     index = -1
@@ -83,5 +83,5 @@ def nearest_within(boxes: Boxes, x: float, y: float, guess: int, least: float) -
 
 @kernel
 def nearest(boxes: Boxes, x: float, y: float, guess: int) -> tuple[float, int]:
-    """`nearest_within` any distance."""
+    """`nearest_within` an infinite distance."""
     return nearest_within(boxes, x, y, guess, np.inf)

@@ -42,7 +42,7 @@ class PairStart(NamedTuple):
 
     Attributes:
         motions: (C, 3). active: (C,). association: (N,). target_tangents: (M, 2). reach: (N, C).
-        log_odds: (C,); (0,): `active` has been decided.
+        log_odds: (C,); (0,): `active` is final.
     """
 
     motions: Array

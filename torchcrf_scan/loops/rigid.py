@@ -11,7 +11,7 @@ from torchcrf_scan.loops.jit import Array, Integers, kernel
 
 
 class Transform(NamedTuple):
-    """A motion ready to be applied to many points: cosine and sine of its rotation, and its translation."""
+    """A motion prepared for many points: cosine and sine of its rotation, and its translation."""
 
     cos: float
     sin: float

@@ -11,7 +11,7 @@ from torchcrf_scan.loops.jit import Array, entry, kernel
 from torchcrf_scan.loops.median import lower_median
 
 ORDERS = (1, 3, 5)  # "first, third or fifth neighbour"
-MIN_ARM = 1e-6  # metres; the angle between shorter arms is undefined and called straight
+MIN_ARM = 1e-6  # metres; the angle between shorter arms is undefined and set to pi
 FARTHEST = max(ORDERS)
 NO_SPACING = 0.1  # metres, of two scans without points
 
@@ -39,7 +39,7 @@ def neighbour(i: int, offset: int, count: int, is_closed: bool) -> int:
 
 @kernel
 def arm_angle(ux: float, uy: float, vx: float, vy: float) -> float:
-    """Angle from u to v in [0, 2 pi); pi where an arm is too short to have a direction."""
+    """Angle from u to v in [0, 2 pi); pi if an arm is too short to have a direction."""
     if min(ux * ux + uy * uy, vx * vx + vy * vy) < MIN_ARM**2:
         return math.pi
     return math.atan2(ux * vy - uy * vx, ux * vx + uy * vy) % (2 * math.pi)
@@ -76,13 +76,13 @@ def describe(points: Array, is_closed: bool) -> Shape:
 
 @kernel
 def nearer_gap(after: float, before: float) -> float:
-    """The smaller of the distances to a point's two neighbours, but for a neighbour on the same spot or at the scan's end."""
+    """The smaller of the distances to a point's two neighbours, ignoring coincident ones and those beyond the scan's end."""
     return min(after, before) if min(after, before) > 0 else max(after, before)
 
 
 @kernel
 def local_spacing(shape: Shape) -> Array:
-    """(P,) metres between a point and the next on its own surface: the nearer of the two neighbours, across no depth jump."""
+    """(P,) metres between a point and the next on its own surface: to the nearer neighbour, so not across a depth jump."""
     spacing = np.empty(len(shape.distance))
     for i in range(len(spacing)):
         spacing[i] = nearer_gap(shape.distance[i, 0, 0], shape.distance[i, 0, 1])
@@ -91,7 +91,7 @@ def local_spacing(shape: Shape) -> Array:
 
 @kernel
 def _open_spacing(points: Array, into: Array) -> None:
-    """`local_spacing` of a scan that is taken as open. points: (P, 2); into: (P,)."""
+    """`local_spacing` of a scan regarded as open. points: (P, 2); into: (P,)."""
     before = 0.0
     for i in range(len(points)):
         j = neighbour(i, 1, len(points), False)
@@ -102,7 +102,7 @@ def _open_spacing(points: Array, into: Array) -> None:
 
 @entry
 def resolution(source_points: Array, target_points: Array, noise: float) -> float:
-    """Metres: half the usual spacing of a pair's points and twice their noise (`features.potentials.resolution`)."""
+    """Metres: half the usual spacing of a pair's points plus twice their noise (`features.potentials.resolution`)."""
     N = len(source_points)
     spacing = np.empty(N + len(target_points))
     _open_spacing(source_points, spacing[:N])

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchcrf_scan.loops.jit import Array, kernel
 
-SWEEPS = 30  # of Jacobi's method, more than it ever takes
+SWEEPS = 30  # of Jacobi's method, more than are ever needed
 
 
 @kernel

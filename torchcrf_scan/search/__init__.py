@@ -1,1 +1,1 @@
-"""InitialiseRT as loops: the background, what it leaves open, hypothesised movers, and the start of the rounds."""
+"""InitialiseRT as loops: registration of the background, hypothesised movers of the unexplained points, and the start."""

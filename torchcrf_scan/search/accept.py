@@ -27,8 +27,8 @@ from torchcrf_scan.search.leftover import Leftover, residual_at
 from torchcrf_scan.search.score import FEATURES, LARGEST, PRODUCTS, HypothesisScore
 
 AS_WELL = 0.5  # units of mean residual up to which a worse motion still explains the same points
-APART = 4.0  # units, and half the extent, from which on two objects of one motion are two
-SHARED = 0.4  # share of points in common from which two hypotheses compete
+APART = 4.0  # units, and half the extent; objects of one motion that are farther apart are two
+SHARED = 0.4  # share of common points above which two hypotheses compete
 
 ONE = np.array([FEATURES.index(one) for one, _ in PRODUCTS])
 OTHER = np.array([FEATURES.index(other) for _, other in PRODUCTS])
@@ -68,7 +68,7 @@ def probabilities_of(score: Score, features: Array) -> Array:
 
 
 class _Accepted(NamedTuple):
-    """Up to G accepted hypotheses: the box (G, 4) round what each moves, how many (G,) and which (G, M) points it explains."""
+    """Up to G accepted hypotheses: bounding box (G, 4) of the members, number (G,) and indices (G, M) of points explained."""
 
     box: Array
     sizes: Integers
@@ -77,11 +77,11 @@ class _Accepted(NamedTuple):
 
 @entry
 def select(leftover: Leftover, hypotheses: Hypotheses, probabilities: Array, threshold: float, most: int) -> Integers:
-    """(G,) numbers of the accepted hypotheses, greedily: the most probable first, its rivals are dropped, and so on.
+    """(G,) numbers of the accepted hypotheses, greedily: the most probable first, without its rivals, and so on.
 
     Args:
         probabilities: (H,).
-        threshold: least probability. most: movers at most.
+        threshold: least probability. most: maximum number of movers.
     """
     source, target, (start, index) = leftover.source.grid.scan.points, leftover.target.grid, hypotheses.groups
     units, motions, group = leftover.target.units, hypotheses.motions, hypotheses.group
@@ -136,7 +136,7 @@ def _has_rival(
     L: int,
     unit: float,
 ) -> bool:
-    """Whether an accepted hypothesis explains the same target points, or the members as well and is near enough to be the same."""
+    """Whether an accepted hypothesis explains the same target points, or explains the members too and is nearby."""
     G = len(accepted)
     for g in range(G):
         if share_in_common(taken.explained[g, : taken.sizes[g]], taken.explained[G, : taken.sizes[G]]) > SHARED:
@@ -165,7 +165,7 @@ def _residual(source: Array, target: ScanGrid, units: Array, motion: Array, inde
 
 @kernel
 def _explained(boxes: Boxes, units: Array, reach: float, sample: Sample, L: int, explained: Integers) -> int:
-    """Writes the target points that the moved members explain to `explained`, ascending; returns how many. reach: metres."""
+    """Writes the target points explained by the moved members to `explained`, ascending; returns their number. reach: metres."""
     around = box_of(sample, L)
     count, last = 0, 0
     for b in range(len(boxes.small)):

@@ -13,30 +13,30 @@ from torchcrf_scan.search.grid import COST_SHARE, ScanGrid, share_of
 from torchcrf_scan.search.registration import register, register_both, surface_residual
 from torchcrf_scan.search.surface import OCCLUDED, SEEN_THROUGH, UNMEASURED, Surface, bearing_of, look_between
 
-TRUNCATION = 3.0  # a residual of three units is as bad as any
-CONTRADICTION = 3.0  # units charged for a point that the other scan sees through (design finding 17)
-TRUSTED = 2.5  # units both ways; a guess that leaves no more unexplained once it is refined has led to the background,
-FOLLOWED = 8.0  # units; if refining has moved half of the points no farther than this
-UNSEEN = 1.5  # units charged for a point that the other scan did not measure; else leaving the map would be free
+TRUNCATION = 3.0  # units; larger residuals are clipped
+CONTRADICTION = 3.0  # units charged for a point that contradicts the other scan's free space (design finding 17)
+TRUSTED = 2.5  # units both ways; a guess with less remaining cost after its refinement is accepted as the background,
+FOLLOWED = 8.0  # units; if the refinement moved half of the points by less than this
+UNSEEN = 1.5  # units charged for a point outside the other scan's view; otherwise leaving the map would be free
 POLISH_GATES, POLISH_ALONG = np.array((4.0, 3.0, 2.0, 1.5)), np.array((0.1,) * 4)
 REFINE_GATES, REFINE_ALONG = np.array((3.0, 2.0, 2.0, 1.5, 1.5, 1.5)), np.array((0.03,) * 6)
 
 
 @entry
 def unit_length(source: Surface, target: Surface) -> float:
-    """Metres: the size of an ordinary registration error, from spacing and noise alone. All gates are multiples of it."""
+    """Metres: the size of an ordinary registration error, from spacing and noise alone: the unit of all gates."""
     return lower_median(np.concatenate((source.spacing, target.spacing))) / 2 + 2 * max(source.noise, target.noise)
 
 
 @kernel
 def every(values: Array, stride: int) -> Array:
-    """Every stride-th of the rows, in one piece."""
+    """Every stride-th of the rows, as a contiguous array."""
     return values[::stride].copy()
 
 
 @kernel
 def stride_of(points: int, most: int) -> int:
-    """Stride through the points that takes about `most` of them, 0: all."""
+    """Stride that selects about `most` of the points, 0: all."""
     return 1 if most == 0 else max(1, -(-points // most))
 
 
@@ -68,7 +68,7 @@ def _charge_far(scan: Surface, moved: Array, share: Array, squared: Array, limit
 
 @kernel
 def _one_way(motion: Array, points: Array, share: Array, other: ScanGrid, slack: float, moved: Array, index: Integers) -> float:
-    """Truncated residual of (P, 2) points under a motion, standing for (P,) shares, in the other scan; see-through charged.
+    """Truncated residual of (P, 2) points under a motion, weighted by (P,) shares, in the other scan, plus the free-space cost.
 
     moved: (3, P) and index: (P,) are scratch space.
     """
@@ -97,8 +97,8 @@ def background_cost(motions: Array, source: ScanGrid, target: ScanGrid, most: in
 
     Args:
         motions: (H, 3).
-        most: about so many points of either scan are looked at, 0: all.
-        slack: factor on what counts as one unit of residual, for motions that are not registered yet.
+        most: approximate number of points of either scan to evaluate, 0: all.
+        slack: factor on the unit of residuals, for motions that are not registered yet.
     """
     points, share = _some_of(source, stride_of(len(source.features), most))
     partners, partner_share = _some_of(target, stride_of(len(target.features), most))
@@ -113,19 +113,19 @@ def background_cost(motions: Array, source: ScanGrid, target: ScanGrid, most: in
 
 @kernel
 def cost_of(motion: Array, source: ScanGrid, target: ScanGrid) -> float:
-    """`background_cost` of one motion (3,), by all points."""
+    """`background_cost` of one motion (3,), with all points."""
     return float(background_cost(motion.reshape(1, 3), source, target, 0, 1.0)[0])
 
 
 @entry
 def polish(motions: Array, source: ScanGrid, target: ScanGrid, unit: float) -> Array:
-    """(H, 3) motions registered with wide gates, from starts (H, 3) that are a few gates off, near enough for `refine`."""
+    """(H, 3) motions registered with wide gates, from starts (H, 3) that are a few gates off; accurate enough for `refine`."""
     return register(source.scan.points, source.pull, target, motions, unit * POLISH_GATES, POLISH_ALONG)
 
 
 @entry
 def refine(motions: Array, source: ScanGrid, target: ScanGrid) -> Array:
-    """(H, 3) motions registered point-to-line by all points both ways, from good starts, by the residual of `background_cost`."""
+    """(H, 3) motions registered point-to-line with all points both ways, from good starts, by the residual of `background_cost`."""
     return register_both(source, target, motions, REFINE_GATES, REFINE_ALONG)
 
 
@@ -140,7 +140,7 @@ def _median_gap(points: Array, one: Array, other: Array) -> float:
 
 @entry
 def follow(guess: Array, source: ScanGrid, target: ScanGrid) -> tuple[bool, Array]:
-    """Whether refining a guess (3,) leads to the background, and the refined motion (3,)."""
+    """Whether the refinement of a guess (3,) is accepted as the background, and the refined motion (3,)."""
     unit = unit_length(source.scan, target.scan)
     motion = refine(polish(guess.reshape(1, 3), source, target, unit), source, target)[0]
     is_near = _median_gap(source.scan.points, motion, guess) < FOLLOWED * unit

@@ -16,19 +16,19 @@ from torchcrf_scan.search.grid import ScanGrid, locate
 from torchcrf_scan.search.hypotheses import Hypotheses
 from torchcrf_scan.search.leftover import Leftover
 
-CONSIDERED = 0.1  # probability from which a mover is considered; the score alone accepts from its own threshold
+CONSIDERED = 0.1  # least probability of a mover that the model considers; the score alone accepts from its own threshold
 FEWEST_POINTS = 3  # a scan with fewer does not determine a motion
-CERTAIN = 1e-6  # probabilities are kept this far from 0 and 1
+CERTAIN = 1e-6  # probabilities are clipped to this distance from 0 and 1
 
 
 @entry
 def choose_movers(
     leftover: Leftover, guess: Array, hypotheses: Hypotheses, features: Array, score: Score, clusters: int, resolution: float
 ) -> PairStart:
-    """The background and the up to `clusters` - 1 movers that the score accepts.
+    """The background and up to `clusters` - 1 movers accepted by the score.
 
     Args:
-        guess: (3,) the pair's initial motion, of clusters that are not there and of a scan with too few points.
+        guess: (3,) the pair's initial motion, used for empty slots and for scans with too few points.
         features: (H, F). resolution: metres, `features.potentials.resolution` of the pair.
     """
     source, target, tangent = leftover.source.grid.scan.points, leftover.target.grid, leftover.target.grid.scan.tangent
@@ -72,12 +72,12 @@ def _reach(points: Array, members: Integers, unit: float, is_near: Booleans) -> 
 
 @kernel
 def _associate(source: Array, target: ScanGrid, motions: Array, active: Booleans, reach: Booleans, noise: float) -> Integers:
-    """(N,) target point that comes nearest under any possible motion, -1 beyond a few units of footprint and noise."""
+    """(N,) nearest target point under any possible motion, -1 beyond a few units of footprint and noise."""
     N = len(source)
     association, least = np.full(N, -1, np.int64), np.empty(N)
     for i in range(N):
         gate = ASSOCIATION_GATE * (math.sqrt(source[i, 0] ** 2 + source[i, 1] ** 2) * FOOTPRINT / 2 + 2 * noise)
-        least[i] = np.nextafter(gate * gate, np.inf)  # the gate itself is near enough
+        least[i] = np.nextafter(gate * gate, np.inf)  # the gate itself is included
     moved, squared, near = np.empty((2, N)), np.empty(N), np.empty(N, np.int64)
     for c in range(len(motions)):
         if not active[c]:

@@ -1,7 +1,6 @@
-"""Matching by shape alone, without any guess of the motion: candidates, an exact chain, two-point RANSAC.
+"""Matching by shape alone, without a guess of the motion: candidates, an exact chain, two-point RANSAC.
 
-The score of all pairs of points is never held: a source point's row of it is made, its best candidates are kept, and the next row
-takes its place.
+The matrix of scores of all pairs of points is never stored: rows are computed one by one, and only the best candidates kept.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ from torchcrf_scan.search.surface import Surface
 
 CANDIDATES = 32
 SAMPLES = 256
-OUTLIER_SCORE = -3.0  # mean channel value below which a place is no better than none
+OUTLIER_SCORE = -3.0  # mean channel value below which the outlier is better
 SEQUENCE, SWITCHING, DISTANCE = 2.0, -1.0, 0.5  # weights of the pairwise features; translation is not invariant
 
 LENGTHS, ANGLES = 12, 3  # rows of `_rows_of`: two distances and two geodesics of three orders, then the angles
-BINS = 256  # that scores are counted in to find the best
+BINS = 256  # of the histogram of scores
 
 _scales = Scales()
 SCALES = _scales.local[:SHAPE_CHANNELS].double().numpy()
@@ -54,9 +53,9 @@ def _rows_of(shape: Shape) -> Array:
 
 @kernel
 def _score_row(source: Array, i: int, target: Array, error: Array) -> None:
-    """Writes (M,) how unlike the surroundings of source point i and of every target point are: minus nine times the score."""
+    """Writes (M,) shape differences of source point i and all target points: minus nine times the score."""
     error[:] = 0.0
-    for c in range(0, LENGTHS, 4):  # some at once: the sums are read and written less often
+    for c in range(0, LENGTHS, 4):  # four at once, to read and write the sums less often
         a, b, d, e = source[c, i], source[c + 1, i], source[c + 2, i], source[c + 3, i]
         one, two, three, four = target[c], target[c + 1], target[c + 2], target[c + 3]
         for j in range(len(error)):
@@ -94,7 +93,7 @@ def _threshold(error: Array, count: int, bins: Integers, edge: Array) -> float:
 
 @kernel
 def shape_candidates(source: Array, target: Array, count: int) -> tuple[Integers, Array]:
-    """(N, K) target points, ascending, that are most like every source point, and their scores; K = `count` or all.
+    """(N, K) target points, ascending, most similar in shape to every source point, and their scores; K = `count` or all.
 
     source: (15, N), target: (15, M) rows. Costs N M.
     """
@@ -122,7 +121,7 @@ def shape_candidates(source: Array, target: Array, count: int) -> tuple[Integers
 
 @kernel
 def _advance(total: Array, x: Array, y: Array, next_x: Array, next_y: Array, gap: float, best: Array) -> None:
-    """Writes the largest of a node's K + 1 totals and the edge from it, for all states of the next node; without `SEQUENCE`."""
+    """Writes the largest sum of a node's K + 1 totals and the edge from it, for all states of the next node; without `SEQUENCE`."""
     K = len(x)
     unlikely = -np.inf
     for j in range(K):
@@ -149,9 +148,9 @@ def _edge(i: int, j: int, here: Integers, there: Integers, x: Array, y: Array, n
 
 @kernel
 def best_labels(source: Array, target: Array, index: Integers, score: Array) -> Integers:
-    """(N,) target points, -1 outlier, of the best labelling of a chain: forward the best totals, back along what made them.
+    """(N,) target points, -1 outlier, of the best labelling of a chain (Viterbi: forward totals, then backtracking).
 
-    Where it is unique it is also the labelling of the largest max-marginals.
+    If unique, it is also the labelling of the largest max-marginals.
 
     Args:
         source: (N, 2), target: (M, 2) points. index, score: (N, K) candidates.
@@ -213,7 +212,7 @@ def shape_association(source: Array, target: Array, noise: float, source_closed:
 
 @entry
 def sampled_motions(source: Array, target: Array, gate: float, picks: Integers) -> tuple[Array, Integers]:
-    """(H, 3) motions of pairs of associations (H, 2), and (H,) number of the associations that each agrees with.
+    """(H, 3) motions of pairs of associations (H, 2), and (H,) number of associations consistent with each.
 
     Args:
         source, target: (P, 2) associated points. gate: metres.
@@ -242,7 +241,7 @@ def _picks(points: int) -> Integers:
 
 
 def ransac_motions(source: Array, target: Array, gate: float, count: int) -> Array:
-    """(count, 3) the two-point motions that agree with most associations; none for fewer than two points.
+    """(count, 3) the two-point motions with most consistent associations; none for fewer than two points.
 
     Args:
         source, target: (P, 2) associated points. gate: metres.
@@ -250,11 +249,11 @@ def ransac_motions(source: Array, target: Array, gate: float, count: int) -> Arr
     if len(source) < 2:
         return np.zeros((0, 3))
     motions, agreeing = sampled_motions(source, target, gate, _picks(len(source)))
-    best = torch.from_numpy(agreeing).topk(min(count, SAMPLES)).indices  # torch has its own order of equals
+    best = torch.from_numpy(agreeing).topk(min(count, SAMPLES)).indices  # torch has its own order of ties
     return motions[best.numpy()]
 
 
 def shape_motions(source: Surface, target: Surface, gate: float, count: int) -> Array:
-    """(count, 3) two-point motions that agree with most associations of `shape_association`. gate: metres."""
+    """(count, 3) two-point motions consistent with most associations of `shape_association`. gate: metres."""
     match = shape_association(source.points, target.points, source.noise, source.is_closed, target.is_closed)
     return ransac_motions(source.points[match >= 0], target.points[match[match >= 0]], gate, count)

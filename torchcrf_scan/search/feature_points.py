@@ -11,7 +11,7 @@ from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.search.leftover import Unexplained
 from torchcrf_scan.search.score import FEATURES
 
-JUMP = 4.0  # units of range beyond an object at which the returns beside it count fully as behind it
+JUMP = 4.0  # units of range beyond an object at which the returns next to it count fully as behind it
 
 Columns: Any = cast(Any, namedtuple)("Columns", FEATURES)
 AT = Columns(*range(len(FEATURES)))  # the number of every feature's column
@@ -54,7 +54,7 @@ def points_of(scan: Unexplained, counted: Booleans) -> Points:
 
 @kernel
 def stands_out(scan: Array, is_closed: bool, first: int, last: int) -> float:
-    """Depth jump at both ends of a set: 1 where the returns beside it lie behind, -1 where they lie before. scan: (P, 9)."""
+    """Depth jump at both ends of a set: 1 if the returns next to it lie behind, -1 if they lie in front. scan: (P, 9)."""
     P = len(scan)
     total = 0.0
     if first > 0 or is_closed:

@@ -1,4 +1,4 @@
-"""The tolerance of the free-space test (design finding 13), that of single points and that of labels alike."""
+"""Tolerance of the free-space test (design finding 13), common to the tests of points and of labels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Grid of a scan for nearest points, laid out once, with the features of every point that registration needs.
+"""Grid of a scan for nearest-point queries, built once, with the per-point features of registration.
 
 A start queries some ten thousand nearest points of the same two scans, a search some hundred thousand.
 """
@@ -14,17 +14,17 @@ from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.nearest import RUN, Boxes, nearest
 from torchcrf_scan.search.surface import Surface
 
-ROUGHNESS = 0.1  # of the spacing: how far an ordinary surface leaves the straight line between two returns,
-LONELY = 0.5  # and a return that has no neighbours
+ROUGHNESS = 0.1  # of the spacing: usual distance of a surface from the straight line between two returns,
+LONELY = 0.5  # and of a return without neighbours
 
-LENGTH_SHARE = (0.25, 4.0)  # median lengths of surface that a point stands for at least and at most, where it pulls,
-COST_SHARE = (0.1, 10.0)  # and where motions are compared
+LENGTH_SHARE = (0.25, 4.0)  # bounds of the length of surface represented by a point, in medians, in registration,
+COST_SHARE = (0.1, 10.0)  # and in the comparison of motions
 
 BLOCKS = 16  # along the longer side of the grid
-POINTS_PER_SIDE, MOST_SIDES = 2, 16  # points of a block that it gets one more cell a side for, and the most cells a side
-GRID_MARGIN = 0.1  # of that side, beyond the scan: points are carried there while a motion is looked for
+POINTS_PER_SIDE, MOST_SIDES = 2, 16  # one more cell a side for every so many points of a block, and the maximum of cells a side
+GRID_MARGIN = 0.1  # of that side, beyond the scan: points move there during the search
 FEATURES = 8  # of a point of a `ScanGrid`; they fill a cache line
-X, Y, TANGENT_X, TANGENT_Y, HALF_SPACING, UNIT = range(6)  # and what they are; the rest is padding
+X, Y, TANGENT_X, TANGENT_Y, HALF_SPACING, UNIT = range(6)  # their meaning; the rest is padding
 
 
 class ScanGrid(NamedTuple):

@@ -18,14 +18,14 @@ from torchcrf_scan.search.groups import MIN_POINTS, Groups, ends, groups_of
 from torchcrf_scan.search.leftover import TRUNCATION, Leftover
 from torchcrf_scan.search.registration import register
 
-FASTEST = 45.0  # metres per second; no road vehicle moves more per second
-FARTHEST = 1.0  # nor farther than this share of its range
+FASTEST = 45.0  # metres per second; limit for road vehicles
+FARTHEST = 1.0  # and limit as a share of the range
 SCREEN_POINTS = 8  # of a segment, to compare starts
 STARTS = 5  # of a segment, to register
 REGISTER_POINTS = 16
 USUAL_TURN = 0.1  # radians, standard deviation of a mover's turn between two scans
 SETTLE_GATES = np.array((4.0, 3.0, 2.0, 2.0, 1.5, 1.5))  # units, one per iteration,
-SETTLE_ALONG = np.array((1.0, 1.0, 0.5, 0.5, 0.2, 0.2))  # and how much of the residual along the surface counts
+SETTLE_ALONG = np.array((1.0, 1.0, 0.5, 0.5, 0.2, 0.2))  # and weight of the residual along the surface
 
 
 class Hypotheses(NamedTuple):
@@ -43,7 +43,7 @@ class Hypotheses(NamedTuple):
 
 @entry
 def members_of(hypotheses: Hypotheses, which: Integers, count: int) -> Booleans:
-    """(G, P) bool: the points that the hypotheses `which` (G,) move, of a scan of P = `count`."""
+    """(G, P) bool: the points moved by the hypotheses `which` (G,), of a scan of P = `count`."""
     start, index = hypotheses.groups
     members = np.zeros((len(which), count), np.bool_)
     for g in range(len(which)):
@@ -94,11 +94,11 @@ def _marks(points: Array, groups: Groups) -> Array:
 def _starts(
     carried: Array, groups: Groups, marks: Array, goals: Array, boxes: Boxes, units: Array, near: float, dt: float
 ) -> tuple[Array, Integers]:
-    """(H, 2) translations after the background's motion whose residual is least and which differ, and (H,) their groups.
+    """(H, 2) distinct translations of least residual after the background's motion, and (H,) their groups.
 
     Args:
         carried: (P, 2). marks: (S, 3, 2), goals: (T, 3, 2). boxes, units: the target, see `residual_units`.
-        near: metres from which two translations differ. dt: seconds.
+        near: metres below which two translations are the same. dt: seconds.
     """
     start, index = groups
     S, A = len(marks), 3 * len(goals) + 1
@@ -117,7 +117,7 @@ def _starts(
 
 @kernel
 def _are_again(goals: Array) -> Booleans:
-    """(T, 3) bool: the same mark as in a set before it, for sets often begin or end at the same point. goals: (T, 3, 2)."""
+    """(T, 3) bool: marks equal to that of an earlier set, as sets often begin or end at the same point. goals: (T, 3, 2)."""
     again = np.zeros((len(goals), 3), np.bool_)
     for m in range(3):
         for t in range(len(goals)):
@@ -130,7 +130,7 @@ def _are_again(goals: Array) -> Booleans:
 
 @kernel
 def _shifts(marks: Array, goals: Array, is_again: Booleans, dt: float, shift: Array) -> int:
-    """Writes to `shift` no translation and those to the marks of every landing, as far as a mover can go; returns how many."""
+    """Writes the zero translation and those to all marks within a mover's reach to `shift`; returns their number."""
     shift[0, 0] = shift[0, 1] = 0.0
     count = 1
     reach = min(math.hypot(marks[0, 0], marks[0, 1]) * FARTHEST, FASTEST * dt)
@@ -151,7 +151,7 @@ def pick(k: int, size: int, most: int) -> int:
 
 @kernel
 def pick_members(members: Integers, points: Array, picked: Array) -> int:
-    """Writes points (P, 2) of at most len(picked) members (L,) to `picked`; returns how many."""
+    """Writes at most len(picked) of the members' points (P, 2) to `picked`, of members (L,); returns their number."""
     count = min(len(members), len(picked))
     for k in range(count):
         i = members[pick(k, len(members), len(picked))]
@@ -161,9 +161,9 @@ def pick_members(members: Integers, points: Array, picked: Array) -> int:
 
 @kernel
 def _screen(boxes: Boxes, units: Array, farthest: float, points: Array, shift: Array, near: float, chosen: Array) -> int:
-    """Writes to `chosen` (K, 2) those of the shifts (A, 2) whose residual is least and which differ; returns how many.
+    """Writes distinct shifts (A, 2) of least residual to `chosen` (K, 2); returns their number.
 
-    A residual is added up no further than up to the least one.
+    The sum of a residual is abandoned when it exceeds the least one.
     """
     cost, seen, guess = np.zeros(len(shift)), np.zeros(len(shift), np.int64), -1
     for k in range(len(chosen)):
@@ -189,7 +189,7 @@ def _screen(boxes: Boxes, units: Array, farthest: float, points: Array, shift: A
 
 @kernel
 def residual_units(boxes: Boxes, units: Array, farthest: float, x: float, y: float, guess: int) -> tuple[float, int]:
-    """Distance to a scan in its local units, truncated, and the index of its nearest point, -1 where that does not matter.
+    """Distance to a scan in its local units, truncated, and the index of its nearest point, -1 for a truncated one.
 
     units: (M,) metres, farthest: `TRUNCATION` times the largest of them. guess: index that is tried first, -1: none.
     """
@@ -204,7 +204,7 @@ def residual_units(boxes: Boxes, units: Array, farthest: float, x: float, y: flo
 def _settle(
     source: Array, groups: Groups, shift: Array, group: Integers, background: Array, target: ScanGrid, unit: float
 ) -> Array:
-    """(H, 3) registered motions, their turns regularised: few points determine a turn badly.
+    """(H, 3) registered motions with regularised rotations, which few points determine badly.
 
     Args:
         source: (P, 2). shift: (H, 2) after the background, group: (H,). unit: metres.
@@ -230,7 +230,7 @@ def _settle(
 
 @kernel
 def _steady(motion: Array, points: Array, heading: float, unit: float) -> Array:
-    """(3,) turns a motion back towards the background's heading about its points' centre, as far as they cannot tell.
+    """(3,) a motion rotated towards the background's heading about its points' centre, as far as the points allow.
 
     Args:
         motion: (3,). points: (L, 2). unit: metres, the error of a point.

@@ -1,4 +1,4 @@
-"""Features that tell a mover's motion from a wrong one, one hypothesis at a time."""
+"""Features that separate right from wrong motions of movers, one hypothesis at a time."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from torchcrf_scan.search.surface import OCCLUDED, SEEN_THROUGH, UNMEASURED
 from torchcrf_scan.search.target_features import target_features, target_scan_of
 
 AROUND = 15  # beams
-RIVALS = 0.7  # share of points in common from which two hypotheses move nearly the same
+RIVALS = 0.7  # share of common points above which two hypotheses are rivals
 USUAL_UNITS, USUAL_COUNT = (
     2.0,
     3.0,
@@ -83,7 +83,7 @@ def _sums(residual: Array) -> Array:
 
 @kernel
 def _group_features(source: Points, members: Integers, index: Integers, usual_range: float, row: Array) -> float:
-    """Writes to `row` the features that all hypotheses of a set share; returns its extent, metres. index: (L,) of the sample."""
+    """Writes the features common to all hypotheses of a set to `row`; returns its extent, metres. index: (L,) of the sample."""
     values, labels, is_closed = source
     size, L = len(members), len(index)
     long, across = _extent(values, index)
@@ -132,7 +132,7 @@ def _extent(points: Array, index: Integers) -> tuple[float, float]:
 
 @kernel
 def _scene_features(source: Array, summed: Array, open_points: int, members: Integers, row: Array) -> None:
-    """Writes the background's residual on the beams beside the members, and its open share of the rest. source: (P, 9)."""
+    """Writes the background's residual on the neighbouring beams, and its open share of the rest. source: (P, 9)."""
     P, size = len(source), len(members)
     total = inside = 0.0
     upto = wide = open_members = 0
@@ -151,7 +151,7 @@ def _scene_features(source: Array, summed: Array, open_points: int, members: Int
 
 @kernel
 def _source_features(source: Points, target: Points, sample: Sample, L: int, size: int, row: Array) -> None:
-    """Writes the residuals and gains of the members, and shares of the points that they land on. size: of the group."""
+    """Writes the residuals and gains of the members, and shares of the points on which they land. size: of the group."""
     residual = gain = fair = 0.0
     explained = seen_through = occluded = 0
     landing_open = landing_through = landing_occluded = landing_unexcused = 0
@@ -191,7 +191,7 @@ def _source_features(source: Points, target: Points, sample: Sample, L: int, siz
 def _motion_features(
     source: Array, step: float, carried: Array, background: Array, motion: Array, sample: Sample, L: int, long: float, row: Array
 ) -> None:
-    """Writes the motion's displacement and turn against the background's.
+    """Writes the motion's displacement and rotation relative to the background's.
 
     Args:
         source: (P, 9). step: radians. carried: (P, 2) points under the background's motion (3,). motion: (3,).
@@ -203,7 +203,7 @@ def _motion_features(
         x, y = x + (sample.moved[0, k] - carried[i, 0]) / L, y + (sample.moved[1, k] - carried[i, 1]) / L
         ranges, unit = ranges + source[i, RANGE] / L, unit + source[i, UNIT] / L
     length = max(math.sqrt(x * x + y * y), 1e-6)
-    back_x, back_y = rotate_back(transform_of(background), x, y)  # the shift turned back, instead of every tangent ahead
+    back_x, back_y = rotate_back(transform_of(background), x, y)  # rotates the shift back, instead of every tangent ahead
     along = 0.0
     for k in range(L):
         i = sample.member[k]
@@ -221,7 +221,7 @@ def _motion_features(
 
 @kernel
 def _rival_features(hypotheses: Hypotheses, features: Array) -> None:
-    """Writes how much worse every hypothesis is than the best that moves nearly the same points. features: (H, F)."""
+    """Writes the deficit of every hypothesis to the best one that moves nearly the same points. features: (H, F)."""
     start, index = hypotheses.groups
     S = len(start) - 1
     best = np.full((S, 3), -np.inf)  # of every group

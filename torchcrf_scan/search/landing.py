@@ -13,7 +13,7 @@ from torchcrf_scan.search.hypotheses import pick
 from torchcrf_scan.search.leftover import residual_at
 from torchcrf_scan.search.surface import look_along
 
-EXPLAINED = 1.0  # units up to which it is explained well
+EXPLAINED = 1.0  # units; smaller residuals count as explained
 FEATURE_POINTS = 24
 
 

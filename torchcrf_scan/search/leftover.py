@@ -13,9 +13,9 @@ from torchcrf_scan.search.background import unit_length
 from torchcrf_scan.search.grid import HALF_SPACING, ScanGrid, locate
 from torchcrf_scan.search.surface import Surface, look_along, number_runs
 
-TRUNCATION = 3.0  # a residual of three units is as bad as any
-OPEN = 1.5  # units from which a point is not explained
-PIECE_GAP = 2.5  # beam spacings from which two neighbours on a segment may be two objects
+TRUNCATION = 3.0  # units; larger residuals are clipped
+OPEN = 1.5  # units; points of larger residual are unexplained
+PIECE_GAP = 2.5  # beam spacings above which two neighbours on a segment may belong to two objects
 
 
 class Unexplained(NamedTuple):
@@ -23,7 +23,7 @@ class Unexplained(NamedTuple):
 
     Attributes:
         grid: the scan, for nearest points.
-        units: (P,) metres, how far from a point a well registered one may lie.
+        units: (P,) metres, usual distance of a well registered point.
         residual: (P,) units to the other scan, at most `TRUNCATION`.
         sight: (P,) free-space test in the other scan (`surface.look_along`).
         piece: (P,) number of every point's piece.
@@ -63,7 +63,7 @@ def leftover_of(source: ScanGrid, target: ScanGrid, background: Array) -> Leftov
 
 @kernel
 def _point_units(grid: ScanGrid) -> Array:
-    """(P,) metres: how far from a point of the surface a well registered point of another scan may lie."""
+    """(P,) metres: usual distance of a well registered point of another scan from a point of the surface."""
     units = np.empty(len(grid.features))
     for i in range(len(units)):
         units[i] = grid.features[i, HALF_SPACING] + 2 * grid.scan.noise

@@ -1,8 +1,8 @@
-"""InitialiseRT of whole pairs (Algorithm 1, line 1): where the rounds start. It decides the result.
+"""InitialiseRT of whole pairs (Algorithm 1, line 1): the start of the rounds, on which the result depends strongly.
 
-    surfaces -> background (a guess that is followed, else a search) -> what it leaves open -> hypothesised movers -> the start
+    surfaces -> background (refined guess, else a search) -> unexplained points -> hypothesised movers -> the start
 
-Every pair is worked on by one thread; where there is one pair, the threads share the hypotheses of its background. No gradient
+Every pair is processed by one thread; for a single pair, the threads share the hypotheses of its background. No gradient
 passes through the start.
 """
 
@@ -31,12 +31,12 @@ T = TypeVar("T")
 
 
 def initialise(batch: ScanPairBatch, score: Score, clusters: int) -> Start:
-    """Background and up to `clusters` - 1 movers of every pair; `batch.initial_motion` is one more guess, not trusted blindly."""
+    """Background and up to `clusters` - 1 movers of every pair; `batch.initial_motion` is one more guess, never taken unchecked."""
     return start_tensors(start_pairs([pair_of(batch, b) for b in range(len(batch))], score, clusters), batch)
 
 
 def start_pairs(pairs: Sequence[Pair], score: Score, clusters: int) -> list[PairStart]:
-    """The same of pairs as arrays, of each for itself."""
+    """The same for pairs as arrays, each by itself."""
     return of_pairs(lambda pair, share: start_pair(pair, score, clusters, share), pairs)
 
 
@@ -46,21 +46,21 @@ def survey(batch: ScanPairBatch) -> list[Survey | None]:
 
 
 def choose(batch: ScanPairBatch, surveys: Sequence[Survey | None], score: Score, clusters: int) -> Start:
-    """The start from what was surveyed: the background and the up to `clusters` - 1 movers that the score accepts."""
+    """The start from the surveys: the background and up to `clusters` - 1 movers accepted by the score."""
     pairs = [pair_of(batch, b) for b in range(len(batch))]
     starts = [start_from(pair, seen, score, clusters) for pair, seen in zip(pairs, surveys, strict=True)]
     return start_tensors(starts, batch)
 
 
 def survey_pair(pair: Pair, share: Share = alone) -> Survey | None:
-    """Surfaces, background and hypotheses; None where a scan has fewer than three points. share: see `background_pool`."""
+    """Surfaces, background and hypotheses; None if a scan has fewer than three points. share: see `background_pool`."""
     if pair.fewest_points < FEWEST_POINTS:
         return None
     return survey_at(*find_start(pair, share), pair.dt)
 
 
 def find_start(pair: Pair, share: Share) -> tuple[ScanGrid, ScanGrid, Array]:
-    """Both scans and the background's motion (3,): where the pair's initial motion leads to, or what a search finds."""
+    """Both scans and the background's motion (3,): the refined initial motion, or the result of a search."""
     source, target = grids_of(pair)
     is_led, background = follow(pair.initial_motion, source, target) if pair.initial_motion.any() else (False, pair.initial_motion)
     return source, target, background if is_led else find_background(source, target, pair.initial_motion, share)
@@ -72,7 +72,7 @@ def start_pair(pair: Pair, score: Score, clusters: int, share: Share = alone) ->
 
 
 def start_from(pair: Pair, seen: Survey | None, score: Score, clusters: int) -> PairStart:
-    """The start of one pair from what was surveyed. clusters: C."""
+    """The start of one pair from its survey. clusters: C."""
     if pair.fewest_points == 0:
         return nothing_found(pair, clusters)
     if seen is None:
@@ -82,7 +82,7 @@ def start_from(pair: Pair, seen: Survey | None, score: Score, clusters: int) -> 
 
 
 def nothing_found(pair: Pair, clusters: int) -> PairStart:
-    """The start where a scan is empty: the initial motion, no movers, no associations."""
+    """The start if a scan is empty: the initial motion, no movers, no associations."""
     N, M = len(pair.source), len(pair.target)
     is_background = np.arange(clusters) == 0
     return PairStart(
@@ -99,7 +99,7 @@ def start_tensors(starts: Sequence[PairStart], batch: ScanPairBatch) -> Start:
     """The starts of all pairs of a batch, padded as the batch is."""
     N, M, clusters = batch.source.shape[1], batch.target.shape[1], len(starts[0].active)
     like = batch.source
-    in_reach = np.broadcast_to(np.arange(clusters) == 0, (N, clusters))  # as everything is of the background, in the padding too
+    in_reach = np.broadcast_to(np.arange(clusters) == 0, (N, clusters))  # everything is within reach of the background, padding too
     return Start(
         motions=torch.from_numpy(np.stack([start.motions for start in starts])).to(like),
         active=torch.from_numpy(np.stack([start.active for start in starts])).to(like.device),

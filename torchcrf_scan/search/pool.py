@@ -1,6 +1,6 @@
-"""Search for the background's motion where no guess leads to it: a pool of hypotheses, narrowed down in stages.
+"""Search for the background's motion without a usable guess: a pool of hypotheses, narrowed down in stages.
 
-Every stage takes a range of hypotheses and holds no lock while it works: threads may share the hypotheses of a stage.
+Every stage takes a range of hypotheses and holds no lock while it runs: threads may share the hypotheses of a stage.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ RANSAC_GATE = 3.0  # units of registration error
 
 COARSE_POINTS = 120
 SEGMENT_POINTS = 24
-COARSE = 6  # hypotheses of the coarse search that are kept; the segments are registered from the best three
+COARSE = 6  # number of hypotheses kept of the coarse search; the segments are registered from the best three
 SLIDES = 10  # steps each way along the walls, for all of them
 SLIDE_STEP = 4.0  # units
-SLID = 6  # kept of these
-KEPT = 12  # so many of all are worth a polish,
-REFINED = 5  # and so many of the polished ones a refinement
+SLID = 6  # number kept of these
+KEPT = 12  # number of all hypotheses that are polished,
+REFINED = 5  # and of polished ones that are refined
 GRID_REACH = 0.12  # of the usual range: the unit of the grid's shifts
 GRID_SHIFTS = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (2.5, 0.0), (-2.5, 0.0))
 GRID_TURNS = (0.0, 0.12, -0.12, 0.3, -0.3)  # radians
-ALIKE_TURN = 0.02  # radians up to which two motions may be the same
-SMALLEST_SEGMENT, SEGMENTS = 6, 12  # points of a segment that is registered alone, and how many segments are
+ALIKE_TURN = 0.02  # radians below which two motions may be the same
+SMALLEST_SEGMENT, SEGMENTS = 6, 12  # points of a segment that is registered alone, and number of such segments
 COARSE_GATES, COARSE_ALONG = np.array((8.0, 8.0, 6.0, 6.0, 4.0, 4.0, 3.0, 2.0)), np.array((1.0,) * 4 + (0.3,) * 4)
 SEGMENT_GATES, SEGMENT_ALONG = np.array((6.0, 4.0, 3.0, 2.0)), np.array((1.0, 1.0, 0.3, 0.3))
 
@@ -58,7 +58,7 @@ def _reach_of(source: Surface, target: Surface) -> float:
 
 
 def start_grid(source: Surface, target: Surface) -> Array:
-    """(H, 3) turns and shifts in shares of the scene's size."""
+    """(H, 3) rotations and shifts scaled by the scene's size."""
     reach = np.float32(GRID_REACH * _reach_of(source, target))  # single precision: the labels on record depend on it
     turns, shifts = np.array(GRID_TURNS, np.float32), np.array(GRID_SHIFTS, np.float32)
     grid = np.concatenate([np.repeat(turns, len(shifts))[:, None], np.tile(shifts, (len(turns), 1)) * reach], axis=1)
@@ -77,7 +77,7 @@ def shifted_from(grid: Array, guesses: Array) -> Array:
 
 @entry
 def search_coarsely(motions: Array, source: ScanGrid, target: ScanGrid, unit: float) -> Array:
-    """(H, 3) motions of some of the source's points, registered with wide gates."""
+    """(H, 3) motions registered with wide gates by a part of the source's points."""
     stride = stride_of(len(source.features), COARSE_POINTS)
     points = every(source.scan.points, stride)
     return register(points, every(source.pull, stride), target, motions, unit * COARSE_GATES, COARSE_ALONG)
@@ -85,7 +85,7 @@ def search_coarsely(motions: Array, source: ScanGrid, target: ScanGrid, unit: fl
 
 @entry
 def slide(motions: Array, target: Surface, unit: float) -> Array:
-    """(H S, 3) motions displaced along the way that most of the target's surface runs: there, registration is slow or blind."""
+    """(H S, 3) motions displaced along the main direction of the target's surfaces, where registration is slow or undetermined."""
     sine = cosine = 0.0
     for i in range(len(target.tangent)):
         x, y = target.tangent[i, 0], target.tangent[i, 1]
@@ -107,7 +107,7 @@ def slide(motions: Array, target: Surface, unit: float) -> Array:
 def large_segments(source: Surface) -> Integers:
     """(S,) numbers of the segments that are registered alone, the largest first."""
     sizes = torch.from_numpy(np.bincount(source.segment))
-    largest = sizes.argsort(descending=True)[:SEGMENTS]  # torch has its own order of equals
+    largest = sizes.argsort(descending=True)[:SEGMENTS]  # torch has its own order of ties
     return largest[sizes[largest] >= SMALLEST_SEGMENT].numpy()
 
 
@@ -130,7 +130,7 @@ def segment_points(source: Surface, chosen: Integers) -> Array:
 
 @entry
 def segment_hypotheses(segments: Array, target: ScanGrid, motions: Array, unit: float) -> Array:
-    """(S H, 3) registers every segment (S, L, 2) alone: where most returns belong to a mover, some segment still is background."""
+    """(S H, 3) registers every segment (S, L, 2) alone: even if most returns belong to a mover, some segment is background."""
     H = len(motions)
     found = np.empty((len(segments) * H, 3))
     weights = np.ones(segments.shape[1])
@@ -141,7 +141,7 @@ def segment_hypotheses(segments: Array, target: ScanGrid, motions: Array, unit: 
 
 @entry
 def distinct(motions: Array, cost: Array, near: float, count: int) -> Integers:
-    """Index of the `count` cheapest motions of which no two are closer than `near` (metres) and alike in their turn."""
+    """Index of the `count` cheapest motions, no two of which are closer than `near` (metres) and similar in rotation."""
     is_left = np.ones(len(motions), np.bool_)
     kept = np.empty(min(count, len(motions)), np.int64)
     for k in range(len(kept)):

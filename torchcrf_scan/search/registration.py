@@ -1,6 +1,6 @@
 """Robust rigid registration by Gauss-Newton steps, one hypothesis at a time.
 
-Inside a loop over hypotheses points are (2, P), so that sums over them run along memory.
+Within a loop over hypotheses points are (2, P), so that sums over them run along memory.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def gauss_newton_step(pairs: Array, along: float) -> Array:
     for i in range(len(weights)):
         w, tx, ty = weights[i], tangent_xs[i], tangent_ys[i]
         rx, ry = xs[i] - partner_xs[i], ys[i] - partner_ys[i]
-        lx, ly = pivot_y - ys[i], xs[i] - pivot_x  # d moved / d theta, turning about the weighted centre
+        lx, ly = pivot_y - ys[i], xs[i] - pivot_x  # d moved / d theta, rotation about the weighted centre
         lever = lx * lx + ly * ly
         wlt, wrt, wst = w * slack * (lx * tx + ly * ty), w * slack * (rx * tx + ry * ty), w * slack * tx
         scale += w * lever
@@ -95,10 +95,10 @@ def register(source: Array, weights: Array, target: ScanGrid, motions: Array, ga
     """(H, 3) refined motions: iterated closest points with robust (Geman-McClure) weights and a shrinking gate.
 
     Args:
-        source: (P, 2), weights: (P,) points and how much they count.
+        source: (P, 2), weights: (P,) points and their weights.
         motions: (H, 3) starts.
-        gates: (I,) residual, in metres, at which a point's weight has fallen to a quarter, of every iteration.
-        along: (I,) how much of the residual along the surface counts (1 = point to point).
+        gates: (I,) residual, in metres, at which a point's weight is a quarter, for every iteration.
+        along: (I,) weight of the residual along the surface (1 = point to point).
     """
     refined = motions.copy()
     pairs, squared, index = np.empty((PAIR_ROWS, len(source))), np.empty(len(source)), np.empty(len(source), np.int64)
@@ -137,8 +137,8 @@ def register_both(source: ScanGrid, target: ScanGrid, motions: Array, gates: Arr
 
     Args:
         motions: (H, 3) starts.
-        gates: (I,) `surface_residual` at which a point's weight has fallen to a quarter, of every iteration.
-        along: (I,) how much of the residual along the surface counts (1 = point to point).
+        gates: (I,) `surface_residual` at which a point's weight is a quarter, for every iteration.
+        along: (I,) weight of the residual along the surface (1 = point to point).
     """
     N, M = len(source.features), len(target.features)
     refined = motions.copy()

@@ -95,7 +95,7 @@ class HypothesisScore(nn.Module):
         self.register_buffer("threshold", torch.tensor(THRESHOLD))
 
     def terms(self, features: Tensor) -> Tensor:
-        """(..., F) features of `hypothesis_features` -> (..., 2F + R) the terms that the weights belong to."""
+        """(..., F) features of `hypothesis_features` -> (..., 2F + R) the weighted terms."""
         standard = ((features - self.mean) / self.scale).clamp(-LARGEST, LARGEST)
         one, other = zip(*PRODUCTS, strict=True)
         products = standard[..., [FEATURES.index(name) for name in one]] * standard[..., [FEATURES.index(name) for name in other]]

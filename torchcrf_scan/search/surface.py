@@ -14,7 +14,7 @@ from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.nearest import Boxes, boxes_of
 from torchcrf_scan.search.free_space import range_slack
 
-GRAZING = math.radians(10.0)  # a surface met at a flatter angle looks like a depth jump (adaptive breakpoint detector)
+GRAZING = math.radians(10.0)  # a larger angle of incidence is taken for a depth jump (adaptive breakpoint detector)
 WIDEST_TURN = GRAZING * (1 - 1e-4)  # between neighbours on a surface; beams are whole steps apart, and just `GRAZING` is too far
 
 AGREES, SEEN_THROUGH, OCCLUDED, UNMEASURED = 0, 1, 2, 3  # results of the free-space test
@@ -103,7 +103,7 @@ def bearing_of(scan: Surface, dx: float, dy: float) -> float:
 
 @kernel
 def look_between(scan: Surface, bearing: float, after: int, reach: float) -> int:
-    """Free-space test of a point at a bearing and `reach` metres away: one of the four answers above.
+    """Free-space test of a point at a bearing and `reach` metres away: one of the four results above.
 
     after: first beam whose bearing is not less.
     """
@@ -128,7 +128,7 @@ def look_between(scan: Surface, bearing: float, after: int, reach: float) -> int
 
 @kernel
 def look_along(scan: Surface, x: float, y: float) -> int:
-    """Free-space test of a point (x, y) in the frame of `scan`: one of the four answers above."""
+    """Free-space test of a point (x, y) in the frame of `scan`: one of the four results above."""
     dx, dy = x - scan.origin[0], y - scan.origin[1]
     bearing = bearing_of(scan, dx, dy)
     return look_between(scan, bearing, int(np.searchsorted(scan.bearings, bearing)), math.sqrt(dx * dx + dy * dy))

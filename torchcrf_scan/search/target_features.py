@@ -1,4 +1,4 @@
-"""Features of a hypothesised motion on the target's side: the unexplained points near the moved members, and what they cover.
+"""Features of a hypothesised motion on the target's side: the unexplained points near the moved members, and those covered.
 
 Only the boxes of the target within reach of a hypothesis are searched.
 """
@@ -128,7 +128,7 @@ def _open_features(target: TargetScan, count: int, long: float, row: Array) -> N
 
 @kernel
 def _cover_features(target: TargetScan, count: int, sample: Sample, L: int, size: int, h: int, row: Array) -> None:
-    """Writes the shares of the segments and pieces that the members land on which they also cover."""
+    """Writes the share that the members cover of the segments and pieces on which they land."""
     values, labels, _ = target.points
     in_segments, in_pieces = _mark_landing(target, sample, L, h)
     covered = in_segments_covered = in_pieces_covered = 0
@@ -145,7 +145,7 @@ def _cover_features(target: TargetScan, count: int, sample: Sample, L: int, size
 
 @kernel
 def _mark_landing(target: TargetScan, sample: Sample, L: int, h: int) -> tuple[float, float]:
-    """Marks the segments and pieces that the members land on; returns their open points and all their points, counted."""
+    """Marks the segments and pieces on which the members land; returns the numbers of their open points and of all their points."""
     in_segments = in_pieces = 0.0
     for k in range(L):
         j = sample.nearest[k]
