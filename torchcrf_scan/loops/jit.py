@@ -28,10 +28,10 @@ Watch = Callable[["Entry", tuple[Any, ...]], None]  # is told of a call
 
 
 class Entry:
-    """A kernel as other code calls it, with positional arguments.
+    """A kernel called from Python, with positional arguments.
 
-    Machine code trusts the types and layout of what it is given. Other arguments than those it was built for are answered by the
-    same loops in plain Python, and a warning names the entry once.
+    Machine code does not check the types and layout of its arguments. Arguments of other layouts are processed by the same
+    loops in plain Python, and a warning names the entry once.
 
     Attributes:
         name: module and function, without the package's name. python: the function itself.

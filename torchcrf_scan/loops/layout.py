@@ -1,4 +1,4 @@
-"""The layout of an entry's arguments: what its machine code is built for, and what it must be given.
+"""The layout of an entry's arguments, for which machine code is built and which every call is checked against.
 
 A layout is `float`, `int` or `bool`; `float64:2` for an array of two dimensions, in C order, aligned and writeable; or a list for a
 tuple: its class as `module:name` (empty for a plain one), then the layouts of its items.
@@ -49,7 +49,7 @@ def class_of(name: str) -> type:
 
 
 def fits(layout: Layout) -> Callable[[Any], bool]:
-    """Whether a value has a layout. It is asked for every argument of every call, so it looks at no more than it must."""
+    """A check whether a value has a layout. It runs for every argument of every call, so it tests the minimum only."""
     if isinstance(layout, list):
         return _fits_tuple(class_of(layout[0]), [fits(item) for item in layout[1:]])
     name, _, dimensions = layout.partition(":")

@@ -1,1 +1,1 @@
-"""Machine code built ahead of time: what it is built for, how, and by which processes."""
+"""Ahead-of-time build of machine code: argument layouts, compilation, and the processes that build."""

@@ -8,7 +8,7 @@ from torchcrf_scan.prepare.build import build_missing, write_progress
 
 
 def main() -> int:
-    """Returns the exit code; what went wrong is the last line on stderr."""
+    """Returns the exit code; the reason of a failure is the last line on stderr."""
     if hasattr(os, "nice"):
         os.nice(10)
     build_missing([processor_level()], write_progress, wait=False)

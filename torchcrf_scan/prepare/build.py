@@ -26,19 +26,19 @@ Progress = Callable[[int, int], None]
 
 
 class NoCompilerError(OSError):
-    """No C compiler is there, which links the extension modules."""
+    """There is no C compiler, which is needed to link the extension modules."""
 
 
 def build_missing(levels: Sequence[str], progress: Progress, *, wait: bool = True) -> Path:
-    """Builds what is missing, and removes what it takes the place of.
+    """Builds the missing machine code, and removes outdated files.
 
     Args:
         levels: of processors, see `machine.processor_level`.
-        progress: is called with how many parts are built, of how many.
-        wait: for another process that builds; else leaves it to that one.
+        progress: called with the number of built parts and of all parts.
+        wait: wait for another process that builds; else leave the build to it.
 
     Returns:
-        The folder that the machine code lies in.
+        The folder of the machine code.
 
     Raises:
         OSError: nowhere to write, or no C compiler.
@@ -82,7 +82,7 @@ def _build_level(level: str, parts: Sequence[str], folder: Path) -> Iterator[str
 
 
 def _publish(beside: Path, path: Path, layouts: dict[str, list[Layout]]) -> None:
-    """Moves an extension to its place, then says what it holds: nobody sees half of it."""
+    """Moves an extension to its final place, then writes its list of entries, so that no incomplete file is visible."""
     told = {"sha256": hashlib.sha256(beside.read_bytes()).hexdigest(), "entries": layouts}
     os.replace(beside, path)
     beside.write_text(json.dumps(told))
@@ -90,7 +90,7 @@ def _publish(beside: Path, path: Path, layouts: dict[str, list[Layout]]) -> None
 
 
 def _remove_older(path: Path, part: str, level: str) -> None:
-    """Removes what this copy of the package built for other states of its sources, by the same Python for the same level."""
+    """Removes files that this copy of the package built from older sources, with the same Python for the same level."""
     suffixes = path.name.removeprefix(machine.stem(part, level))
     for suffix in (suffixes, str(Path(suffixes).with_suffix(".json"))):
         for old in path.parent.glob(f"{part}-*-{level}{suffix}*"):

@@ -38,7 +38,7 @@ def record_layouts() -> dict[str, list[Layout]]:
 
 
 def answer_examples() -> None:
-    """A cold pair, one with a guess, an empty scan, and what the fit of the movers' score does with a pair."""
+    """Runs a cold pair, one with a guess, an empty scan, and the functions used by the fit of the movers' score."""
     pairs = simulate_pairs(SimulatorConfig(beams=BEAMS), 2, 1, 0)
     pair = pairs[0]
     guess = ScanPair(pair.source, pair.target, pair.dt, initial_motion=np.array([0.0, 0.1, 0.0]))
