@@ -1,7 +1,11 @@
 """Work dealt out to threads: all of it, in order, on no more threads than there may be, and errors come back."""
 
+import os
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +13,8 @@ import torch
 
 from torchcrf_scan.loops.jit import Array
 from torchcrf_scan.loops.threads import for_each, in_parts
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(params=[1, 2, 5])
@@ -53,3 +59,23 @@ def test_what_goes_wrong_in_a_thread_is_told(threads: int) -> None:
 
     with pytest.raises(ValueError, match="item"):
         for_each(fail, range(8))
+
+
+FORK = """
+import multiprocessing, torch
+from torchcrf_scan.loops.threads import for_each
+
+def squares(count):
+    return for_each(lambda item: item**2, range(count))
+
+torch.set_num_threads(2)
+assert squares(4) == [0, 1, 4, 9]
+with multiprocessing.get_context("fork").Pool(1) as pool:
+    print(pool.apply_async(squares, (5,)).get(30))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_child_has_threads_of_its_own() -> None:
+    done = subprocess.run([sys.executable, "-c", FORK], cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout == "[0, 1, 4, 9, 16]\n"

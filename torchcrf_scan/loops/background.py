@@ -59,7 +59,8 @@ class Background:
         command = [sys.executable, "-P", "-m", "torchcrf_scan.prepare"]  # -P: not what lies in the working directory
         paths = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
         environment = {**os.environ, "PYTHONPATH": paths, SWITCH: "0"}
-        with (folder / LOG_FILE).open("wb") as file:
+        (folder / PROGRESS_FILE).unlink(missing_ok=True)
+        with (folder / LOG_FILE).open("ab") as file:
             self.process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True, env=environment
             )
