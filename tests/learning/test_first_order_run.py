@@ -107,7 +107,7 @@ def test_help_tells_of_every_setting(capsys: pytest.CaptureFixture[str]) -> None
     for name in flatten(Config()):
         assert f"--{name} " in text, name
     assert "--resume" in text
-    assert text.count("share of the highest learning rate") == 1  # a docstring's words
+    assert text.count("final learning rate as a share of the maximum") == 1  # a docstring's words
 
 
 # --- settings -----------------------------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from torchcrf_scan.scan import FARTHEST, PairPrediction, ScanPair
 Turn = float | Literal["any"]
 
 
+@torch.no_grad()
 def predict(model: JointScanCRF, batch: ScanPairBatch) -> Prediction:
     """The model's answers, in double precision where the loops give them, as `match_pairs` does."""
     return model(batch.to(torch.float64) if can_decode(model.config, batch.source.device) else batch)
