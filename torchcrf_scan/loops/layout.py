@@ -15,7 +15,6 @@ import numpy as np
 Layout = str | list[Any]
 
 NUMBERS = {"float": (float, int, np.floating, np.integer), "int": (int, np.integer), "bool": (bool, np.bool_)}
-IN_ORDER = 0x0001 | 0x0100 | 0x0400  # numpy's flags of an array in C order, aligned and writeable
 
 
 def layout_of(value: Any, hint: Any = None) -> Layout:
@@ -75,8 +74,6 @@ def _fits_array(dtype: np.dtype[Any], dimensions: int) -> Callable[[Any], bool]:
     array = np.ndarray
 
     def check(value: Any) -> bool:
-        if type(value) is not array or value.dtype != dtype or value.ndim != dimensions:
-            return False
-        return value.flags.num & IN_ORDER == IN_ORDER
+        return type(value) is array and value.dtype == dtype and value.ndim == dimensions and value.flags.carray
 
     return check
