@@ -64,3 +64,13 @@ def test_what_kernels_do_not_take_has_no_layout() -> None:
 def test_the_class_of_a_tuple_is_found_by_its_name() -> None:
     assert class_of(layout_of(PLACE)[0]) is Place
     assert class_of("") is tuple
+
+
+def test_what_fitted_before_is_known_by_what_it_is_not_by_its_equal() -> None:
+    check = fits(layout_of(PLACE))
+    for _ in range(30):
+        good, bad = PLACE._replace(count=3), PLACE._replace(count=3, at=np.zeros(3))
+        assert check(good)
+        assert check(good)
+        assert not check(bad)
+    assert not check(None)

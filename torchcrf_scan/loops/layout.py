@@ -6,7 +6,9 @@ tuple: its class as `module:name` (empty for a plain one), then the layouts of i
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
+from functools import cache
 from importlib import import_module
 from typing import Any, get_type_hints
 
@@ -15,6 +17,7 @@ import numpy as np
 Layout = str | list[Any]
 
 NUMBERS = {"float": (float, int, np.floating, np.integer), "int": (int, np.integer), "bool": (bool, np.bool_)}
+REMEMBERED = 8  # tuples of a layout
 
 
 def layout_of(value: Any, hint: Any = None) -> Layout:
@@ -50,7 +53,7 @@ def class_of(name: str) -> type:
 def fits(layout: Layout) -> Callable[[Any], bool]:
     """A check whether a value has a layout. It runs for every argument of every call, so it tests the minimum only."""
     if isinstance(layout, list):
-        return _fits_tuple(class_of(layout[0]), [fits(item) for item in layout[1:]])
+        return _fits_tuple(json.dumps(layout))
     name, _, dimensions = layout.partition(":")
     if dimensions:
         return _fits_array(np.dtype(name), int(dimensions))
@@ -58,13 +61,24 @@ def fits(layout: Layout) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, kinds)
 
 
-def _fits_tuple(kind: Any, checks: Sequence[Callable[[Any], bool]]) -> Callable[[Any], bool]:
+@cache
+def _fits_tuple(layout: str) -> Callable[[Any], bool]:
+    """One for all entries that take such a tuple: it remembers the last ones that fit, which go from entry to entry."""
+    name, *items = json.loads(layout)
+    kind: Any = class_of(name)
+    checks, fitting = [fits(item) for item in items], dict[int, Any]()
+
     def check(value: Any) -> bool:
+        if fitting.get(id(value), fitting) is value:
+            return True
         if type(value) is not kind or len(value) != len(checks):
             return False
-        for fits_item, item in zip(checks, value, strict=True):  # noqa: SIM110 (a generator takes twice as long)
+        for fits_item, item in zip(checks, value, strict=True):
             if not fits_item(item):
                 return False
+        if len(fitting) >= REMEMBERED:
+            fitting.clear()
+        fitting[id(value)] = value
         return True
 
     return check
