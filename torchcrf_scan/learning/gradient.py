@@ -158,6 +158,21 @@ def has_amp(config: GradientConfig, device: torch.device) -> bool:
     return config.amp and device.type == "cuda" and torch.cuda.is_bf16_supported()
 
 
+def refuse_remainder(gradient: GradientConfig, ranks: Ranks) -> None:
+    """Raises ValueError where the parts of a step cannot be divided evenly among the processes."""
+    if gradient.batch_size // gradient.part % ranks.world:
+        parts = f"{gradient.batch_size} / {gradient.part}"
+        raise ValueError(f"gradient.part: expected {parts} parts to be shared out among {ranks.world} processes, got a remainder")
+
+
+def portions_from(step: int, config: Config, pairs: Sequence[ScanPair], ranks: Ranks) -> Iterator[Portion]:
+    """This process's portions of all steps after `step`."""
+    gradient = config.gradient
+    parts = Parts(gradient.batch_size, gradient.part, step, gradient.steps, ranks.rank, ranks.world)
+    collate = Collate(config.learning.disturbance, gradient.seed, LOSSES[config.first_order].needs_start)
+    return load_portions(PairStream(gradient, pairs), parts, collate, gradient.workers)
+
+
 def train_by_gradient(
     model: JointScanCRF,
     config: Config,
@@ -179,11 +194,8 @@ def train_by_gradient(
         ValueError: the parts of a step cannot be divided evenly among the processes.
     """
     gradient = config.gradient
-    if gradient.batch_size // gradient.part % ranks.world:
-        parts = f"{gradient.batch_size} / {gradient.part}"
-        raise ValueError(f"gradient.part: expected {parts} parts to be shared out among {ranks.world} processes, got a remainder")
+    refuse_remainder(gradient, ranks)
     objective = make_objective(config)
-    needs_start = LOSSES[config.first_order].needs_start
     learner = Learner(model, gradient, ranks)
     validation = Validation.of(held_out, gradient.part, ranks)
 
@@ -208,9 +220,7 @@ def train_by_gradient(
     else:
         learner.load_state_dict(state)
         set_random_state(state["random"])
-    parts_left = Parts(gradient.batch_size, gradient.part, learner.step, gradient.steps, ranks.rank, ranks.world)
-    collate = Collate(config.learning.disturbance, gradient.seed, needs_start)
-    portions = load_portions(PairStream(gradient, pairs), parts_left, collate, gradient.workers)
+    portions = portions_from(learner.step, config, pairs, ranks)
     while learner.step < gradient.steps and not learner.stopping.is_over:
         report = learner.descend(objective, portions)
         if monitor is not None:
