@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 from torch.overrides import TorchFunctionMode
 
-from torchcrf_scan.batch import ScanPairBatch, scale_motions
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import JointScanCRF
@@ -100,12 +100,12 @@ class UnrolledDecoder(nn.Module):
     def _answers(self, batch: ScanPairBatch, start: Start) -> dict[str, Tensor]:
         view = self.model.view(batch, self.model.learned_inputs(batch, start))
         fitted = self.model.fitted
-        state = sweep.settle(view, start.scaled(view.factor), fitted, self.model.config).state
+        state = sweep.settle(view, view.in_unit(start), fitted, self.model.config).state
         association_confidence, cluster_confidence = fitted.calibration(state)
         return {
             "association": state.association,
             "cluster": state.cluster,
-            "motions": scale_motions(state.motions.value, 1 / view.factor),
+            "motions": view.in_metres(state.motions.value),
             "active": state.motions.active,
             "candidates": state.candidates,
             "log_association": state.log_association,

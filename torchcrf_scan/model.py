@@ -167,7 +167,7 @@ class JointScanCRF(nn.Module):
             return found
         with torch.autocast(batch.source.device.type, enabled=False):  # centimetres decide which movers are found
             view = self.view(batch)
-            return begin(view, found.scaled(view.factor), self.fitted, self.config.inference).scaled(1 / view.factor)
+            return view.in_metres(begin(view, view.in_unit(found), self.fitted, self.config.inference))
 
     def forward(
         self,
@@ -210,8 +210,8 @@ class JointScanCRF(nn.Module):
         """The rounds in tensors, all pairs at once, with a gradient if the schedule supports it."""
         view = self.view(batch, learned)  # features, in their unit of length
         decode = DECODERS[self.config.inference.schedule]
-        found = decode(view, start.scaled(view.factor), self.fitted, self.config)
-        return found.scaled(1 / view.factor)  # metres
+        found = decode(view, view.in_unit(start), self.fitted, self.config)
+        return view.in_metres(found)  # metres
 
     def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
         """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.

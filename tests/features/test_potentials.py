@@ -6,7 +6,7 @@ import numpy as np
 import oracles
 import pytest
 import torch
-from support import assert_close, make_points, normal
+from support import all_real, assert_close, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
@@ -14,6 +14,7 @@ from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features.potentials import PairView, find_candidates, shape_score
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference.start import Start
 from torchcrf_scan.names import SHAPE_CHANNELS
 
 N, M, C = 14, 11, 3
@@ -114,3 +115,18 @@ def test_points_of_a_moved_scan_are_most_alike_themselves() -> None:
     mask = torch.ones(1, 30, dtype=torch.bool)
     batch = replace(make_view().batch, source=source, target=target, source_mask=mask, target_mask=mask)
     assert (shape_score(PairView.of(batch))[0, 5:25].argmax(-1) == torch.arange(5, 25)).all()
+
+
+def test_a_view_changes_the_unit_of_length_there_and_back() -> None:
+    points = make_points(12, 3)[None]
+    mask, closed, one = all_real(points), torch.tensor([False]), torch.ones(1, dtype=torch.float64)
+    batch = ScanPairBatch(points, points + 0.1, mask, mask, closed, closed, one, 0.01 * one, torch.zeros(1, 3).double())
+    view = PairView.of(batch, length_unit="spacing")
+    motions = torch.tensor([[[0.1, 2.0, -3.0], [0.0, 1.0, 0.0]]], dtype=torch.float64)
+    found = view.in_unit(motions)
+    assert_close(found[..., 0], motions[..., 0])
+    assert_close(found[..., 1:], motions[..., 1:] * view.factor)
+    assert_close(view.in_metres(found), motions)
+    start = Start.at(batch, motions, torch.ones(1, 2, dtype=torch.bool))
+    assert_close(view.in_unit(start).motions, found)
+    assert_close(view.batch.source, batch.source * view.factor)

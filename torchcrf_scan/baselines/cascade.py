@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from torchcrf_scan.batch import ScanPairBatch, scale_motions
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import ClusteringCRF, MatchingCRF
 from torchcrf_scan.prediction import Prediction
@@ -23,9 +23,9 @@ class Cascade:
         matched = self.matching(batch, start.background_alone())
         clusters = self.clustering.config.inference.clusters - 1
         view, fitted = self.clustering.view(batch), self.matching.fitted
-        background = scale_motions(matched.motions[:, 0], view.factor)
+        background = view.in_unit(matched.motions[:, 0])
         fed = movers_from_associations(view, background, matched.association, fitted, clusters, start.target_tangents)
-        return fed.scaled(1 / view.factor)
+        return view.in_metres(fed)
 
     def __call__(self, batch: ScanPairBatch, start: Start) -> Prediction:
         """Decodes a batch."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol, Self, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 
-from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch, scale_motions
 from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features import association, candidates, clustering
 from torchcrf_scan.features.boosting import StumpEnsemble
@@ -33,6 +34,16 @@ class Boosters(nn.Module):
         super().__init__()
         self.data = StumpEnsemble(len(LOCAL_CHANNELS), stumps, width=width, is_learned=is_learned)
         self.outlier = StumpEnsemble(OUTLIER_INPUTS, stumps, width=width, is_learned=is_learned)
+
+
+class WithLengths(Protocol):
+    """What can be given in another unit of length: a start, a prediction."""
+
+    def scaled(self, factor: Tensor) -> Self:
+        """The same with its lengths times a factor (B,)."""
+
+
+Given = TypeVar("Given", bound=WithLengths | Tensor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +89,18 @@ class PairView:
             Sweep.of(batch.target, batch.target_mask, target_closed, batch.range_noise, batch.target_origin),
             learned,
         )
+
+    def in_unit(self, given: Given) -> Given:
+        """A start, or motions (B, ..., 3), from metres to the features' unit of length."""
+        return _scaled(given, self.factor)
+
+    def in_metres(self, found: Given) -> Given:
+        """A start, a prediction, or motions (B, ..., 3), from the features' unit of length to metres."""
+        return _scaled(found, 1 / self.factor)
+
+
+def _scaled(given: Given, factor: Tensor) -> Given:
+    return cast(Given, scale_motions(given, factor) if isinstance(given, Tensor) else given.scaled(factor))
 
 
 @torch.no_grad()

@@ -119,7 +119,7 @@ def fit_one_chain(
 def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generator: torch.Generator) -> Lesson:
     """The training plug-ins of one batch; for CRF-Matching every point moves with the background."""
     view = model.view(part.batch)
-    start = part.start.scaled(view.factor)
+    start = view.in_unit(part.start)
     plugins = training_plugins(view.batch, start, config, generator)
     if not model.config.has_clusters:
         plugins, start = pseudo_likelihood.for_background_alone(plugins), start.background_alone()

@@ -213,7 +213,7 @@ def belief_changes(model: JointScanCRF, batch: ScanPairBatch, start: Start) -> d
     if not SCHEDULES[model.config.inference.schedule].takes_couplings:
         return {}
     view = model.view(batch, model.learned_inputs(batch, start))
-    found = sweep.rounds(view, start.scaled(view.factor), model.fitted, model.config)
+    found = sweep.rounds(view, view.in_unit(start), model.fitted, model.config)
     beliefs = [of.state.log_cluster.exp() for of in found]
     if beliefs[0].shape != beliefs[-1].shape:  # CRF-Matching has other states than its start
         beliefs = beliefs[1:]

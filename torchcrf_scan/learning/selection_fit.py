@@ -43,7 +43,7 @@ def fit_potential(model: JointScanCRF, material: Sequence[Material]) -> ClusterP
 def judge_clusters(model: JointScanCRF, part: Material) -> tuple[Tensor, Tensor]:
     """The potential's terms (P, 2) of all movers considered in a batch, and (P,) 1 if the cluster is a true mover's, else 0."""
     view = model.view(part.batch, model.learned_inputs(part.batch, part.start))
-    start = part.start.scaled(view.factor).considered()
+    start = view.in_unit(part.start).considered()
     parameters, config = model.fitted, model.config.inference
     state = joint.first_state(view, start, parameters, config)
     assert start.log_odds is not None

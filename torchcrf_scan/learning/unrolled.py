@@ -101,7 +101,7 @@ def unrolled_sums(
         raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
     start = start or model.initialise(batch)
     view = model.view(batch, model.learned_inputs(batch, start, **layer_inputs))
-    rounds = sweep.rounds(view, start.scaled(view.factor), model.fitted, unrolled_settings(model.config, config))
+    rounds = sweep.rounds(view, view.in_unit(start), model.fitted, unrolled_settings(model.config, config))
     weights = round_weights(config)
     states = [joint.merge_alike(view, done.state, model.scales.cluster_distance) for done in rounds[-len(weights) :]]
     slots = match_clusters(view.batch, states[-1], config.temperature)
