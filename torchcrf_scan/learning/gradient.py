@@ -196,8 +196,7 @@ def train_by_gradient(
     gradient = config.gradient
     refuse_remainder(gradient, ranks)
     objective = make_objective(config)
-    learner = Learner(model, gradient, ranks)
-    validation = Validation.of(held_out, gradient.part, ranks)
+    learner, validation = Learner(model, gradient, ranks), Validation.of(held_out, gradient.part, ranks)
 
     def look() -> None:
         if not held_out:
