@@ -15,6 +15,7 @@ from typing import Any
 from torchcrf_scan.benchmark.limits import Rates
 from torchcrf_scan.benchmark.plan import WHOLE
 from torchcrf_scan.evaluation.report import Table
+from torchcrf_scan.whole_file import write_whole
 
 Row = Mapping[str, Any]
 NAN = float("nan")
@@ -25,9 +26,7 @@ def write_report(path: Path, rows: Sequence[Row], rates: Rates) -> None:
     """Writes `{"machine": ..., "rows": [...]}` atomically, with null for missing values."""
     machine = {**describe_machine(), "per_second_one_thread": asdict(rates)}
     text = json.dumps({"machine": machine, "rows": [_finite(row) for row in rows]}, indent=1, allow_nan=False) + "\n"
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text)
-    os.replace(temporary, path)
+    write_whole(path, text)
 
 
 def describe_machine() -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from torchcrf_scan.learning.fit import Margins
 from torchcrf_scan.learning.material import Collection, collect
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import Floats, ScanPair
+from torchcrf_scan.whole_file import write_whole
 
 Features = tuple[JointScanCRF, Margins]  # a model with fitted scales and boosters, and its out-of-fold boosters
 
@@ -55,9 +55,7 @@ class Study:
         """Saves scales and boosters for other variants, in this or another process; written atomically."""
         place = self._place(key)
         if place is not None and not place.is_file():
-            temporary = place.with_suffix(f".{os.getpid()}")
-            temporary.write_bytes(pickle.dumps(features))
-            os.replace(temporary, place)
+            write_whole(place, pickle.dumps(features))
 
     def _place(self, key: str) -> Path | None:
         return self.kept and self.kept / hashlib.sha256(key.encode()).hexdigest()
