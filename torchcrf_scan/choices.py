@@ -109,7 +109,7 @@ MOTION_METRICS: Mapping[str, MotionMetric] = {
     "line": MotionMetric(),
     "given": MotionMetric(is_fitted=False),
 }
-MOTION_WEIGHTS: Mapping[str, Variant] = {"hard": Variant(), "soft": Variant(in_loops=False)}
+MOTION_WEIGHTS: Mapping[str, Variant] = {"hard": Variant(), "soft": Variant()}
 MOVERS: Mapping[str, Variant] = {"joint": Variant(), "threshold": Variant()}
 CANDIDATE_SEARCHES: Mapping[str, Variant] = {
     "motion": Variant(),

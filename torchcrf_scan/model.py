@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.func import debug_unwrap
 
+from torchcrf_scan.adjoint import layer as adjoint
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.choices import STARTS
 from torchcrf_scan.config import ModelConfig
@@ -191,20 +193,30 @@ class JointScanCRF(nn.Module):
         learned = self.learned_inputs(  # of the encoder and of the caller
             batch, start, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
         )
-        rounds = self._in_loops if self._suits_loops(batch, learned) else self._in_tensors  # the engine
+        rounds = self._in_loops if self._suits_loops(batch, start, learned) else self._in_tensors  # the engine
         return rounds(batch, start, learned)  # potentials, messages, motions, repeated until convergence
 
-    def _suits_loops(self, batch: ScanPairBatch, learned: LearnedInputs | None) -> bool:
-        """Whether the loops can compute the rounds: on a CPU, for supported settings, without a gradient."""
-        extra = () if learned is None else (learned.outlier, learned.moving)
-        tensors = (*self.parameters(), batch.source, batch.target, batch.initial_motion, *extra)
-        needs_gradient = torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in tensors)
+    def _suits_loops(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> bool:
+        """Whether the loops can compute the rounds: on a CPU, for supported settings and gradients."""
+        inputs = {"batch.source": batch.source, "batch.target": batch.target, "batch.initial_motion": batch.initial_motion}
+        inputs |= {"start.motions": start.motions} | dict(self.boosters.named_parameters(prefix="boosters"))
+        slopes = [name for name, tensor in inputs.items() if torch.is_grad_enabled() and tensor.requires_grad]
         has_embeddings = learned is not None and learned.embeddings is not None
-        return can_decode(self.config, batch.source.device, needs_gradient=needs_gradient, has_embeddings=has_embeddings)
+        is_transformed = any(debug_unwrap(tensor) is not tensor for tensor in (*self.parameters(), *inputs.values()))
+        return can_decode(
+            self.config, batch.source.device, slopes=slopes, has_embeddings=has_embeddings, is_transformed=is_transformed
+        )
 
     def _in_loops(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
-        """The rounds in machine code, one pair per thread, without a gradient."""
+        """The rounds in machine code, one pair per thread, there and back."""
+        if self._needs_gradient(learned) and self.config.inference.iterations > 0:
+            return adjoint.predict(batch, start, self.fitted, self.config, learned)
         return predict(batch, start, fitted_of(self.fitted), settings_of(self.config), learned)
+
+    def _needs_gradient(self, learned: LearnedInputs | None) -> bool:
+        extra = () if learned is None else (learned.outlier, learned.moving)
+        wanted = (*self.association_weights.values(), *self.clustering_weights.values(), *extra)
+        return torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in wanted)
 
     def _in_tensors(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
         """The rounds in tensors, all pairs at once, with a gradient if the schedule supports it."""

@@ -32,13 +32,19 @@ class Fitted(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """The settings used by the rounds; `metric` is an index of `motion.METRICS`."""
+    """The settings used by the rounds; `metric` is an index of `motion.METRICS`.
+
+    Attributes:
+        is_soft: motions are fitted to beliefs, not to labels. detaches: no gradient passes through motions to features.
+    """
 
     candidates: int
     iterations: int
     stop_early: bool
     is_joint: bool
     metric: int
+    is_soft: bool
+    detaches: bool
     min_extent: float
     rotation_tolerance: float
     translation_tolerance: float
@@ -134,6 +140,8 @@ def settings_of(model: ModelConfig) -> Settings:
         config.stop_early,
         config.movers == "joint",
         METRICS.index(config.motion_metric),
+        config.motion_weights == "soft",
+        config.detach_motion,
         config.min_extent,
         config.rotation_tolerance,
         config.translation_tolerance,

@@ -32,13 +32,14 @@ DATA_BOOSTING, OUTLIER_BOOSTING, EXCESS, GATE, OUTLIER_BIAS, SEEN_THROUGH, HIDDE
 
 
 @kernel
-def _sigmoid(x: float) -> float:
+def sigmoid(x: float) -> float:
+    """1 / (1 + exp(-x))."""
     below = exp_below(-abs(x))
     return (1.0 if x > 0 else below) / (1 + below)
 
 
 @kernel
-def _distances(pair: AssociationPair, work: Workspace, moved: Array) -> tuple[Array, Array]:
+def distances(pair: AssociationPair, work: Workspace, moved: Array) -> tuple[Array, Array]:
     """(N K,) metres to the candidates after the points' own motion, inf for those that are not real, and (N,) the least."""
     N, K = work.candidates.shape
     distance, nearest = np.empty(N * K), np.empty(N)
@@ -54,7 +55,7 @@ def _distances(pair: AssociationPair, work: Workspace, moved: Array) -> tuple[Ar
 
 
 @kernel
-def _outlier_margin(model: AssociationModel, work: Workspace, i: int, registered: float, margin_of: Array) -> float:
+def outlier_margin(model: AssociationModel, work: Workspace, i: int, registered: float, margin_of: Array) -> float:
     """The outlier booster of source point i. registered: the best L12; margin_of: (K,) data booster."""
     K = work.candidates.shape[1]
     best, place = -np.inf, -1
@@ -82,14 +83,14 @@ def log_unary_of(
     """
     N, K = work.candidates.shape
     weights = model.weights
-    distance, nearest = _distances(pair, work, moved)
+    distance, nearest = distances(pair, work, moved)
     registered, values, boosted = np.empty(N * K), np.zeros(N * K), np.zeros(N * K)
     for p in range(N * K):  # long loops without branches, several pairs at once
         registered[p] = robust_square(distance[p], model.per_local[REGISTERED])
     add_margins(model.data, REGISTERED, registered, boosted)
     if weights[GATE] != 0:
         for p in range(N * K):
-            values[p] -= weights[GATE] * _sigmoid((distance[p] / model.gate - 1) / GATE_WIDTH)
+            values[p] -= weights[GATE] * sigmoid((distance[p] / model.gate - 1) / GATE_WIDTH)
     constant = weights[OUTLIER_BIAS]
     for c in range(len(LOCAL_CHANNELS)):
         constant += weights[c] * model.local_outlier[c]
@@ -108,7 +109,7 @@ def log_unary_of(
         value = constant + weights[SEEN_THROUGH] * seen_through[i] + weights[HIDDEN] * hidden[i]
         if weights[OUTLIER_BOOSTING] != 0:
             best = robust_square(nearest[i], model.per_local[REGISTERED])
-            value += weights[OUTLIER_BOOSTING] * _outlier_margin(model, work, i, best, margins)
+            value += weights[OUTLIER_BOOSTING] * outlier_margin(model, work, i, best, margins)
         log_unary[i, K] = value
     return log_unary
 
@@ -261,17 +262,25 @@ def associate(
 
 
 @kernel
+def best_clusters(active: Booleans, log_cluster: Array) -> Integers:
+    """(N,) best active inlier cluster of every point. active: (C,); log_cluster: (N, D), the outlier last."""
+    labels = np.zeros(len(log_cluster), np.int64)
+    for i in range(len(log_cluster)):
+        largest = -np.inf
+        for c in range(len(active)):
+            if active[c] and log_cluster[i, c] > largest:
+                labels[i], largest = c, log_cluster[i, c]
+    return labels
+
+
+@kernel
 def registered_points(source: Array, motions: Array, active: Booleans, log_cluster: Array) -> Array:
     """(N, 2) source points under the best active inlier cluster each (A-12).
 
     source: (N, 2); motions: (C, 3); active: (C,); log_cluster: (N, D), the outlier last.
     """
-    C, moved = len(active), np.empty_like(source)
-    transforms = [transform_of(motions[c]) for c in range(C)]
+    best, moved = best_clusters(active, log_cluster), np.empty_like(source)
+    transforms = [transform_of(motions[c]) for c in range(len(active))]
     for i in range(len(source)):
-        best, largest = 0, -np.inf
-        for c in range(C):
-            if active[c] and log_cluster[i, c] > largest:
-                best, largest = c, log_cluster[i, c]
-        moved[i, 0], moved[i, 1] = transform(transforms[best], source[i, 0], source[i, 1])
+        moved[i, 0], moved[i, 1] = transform(transforms[best[i]], source[i, 0], source[i, 1])
     return moved

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from torchcrf_scan.config import ModelConfig
@@ -16,10 +18,20 @@ def can_run(backend: str, device: torch.device) -> bool:
     return _decide(backend, _why_not_here(device))
 
 
-def can_decode(model: ModelConfig, device: torch.device, *, needs_gradient: bool = False, has_embeddings: bool = False) -> bool:
+def can_decode(
+    model: ModelConfig,
+    device: torch.device,
+    *,
+    slopes: Sequence[str] = (),
+    has_embeddings: bool = False,
+    is_transformed: bool = False,
+) -> bool:
     """Whether loops run the rounds of a model; errors as in `can_run`.
 
-    has_embeddings: some were given, or the model's encoder makes them.
+    Args:
+        slopes: what a gradient is asked for beside weights and extra log potentials, e.g. `batch.source`.
+        has_embeddings: some were given, or the model's encoder makes them.
+        is_transformed: the call is inside a transform of `torch.func`.
     """
     unknown = [f"{name}: {value}" for name, value in model.without("in_loops").items()]
     reason = _why_not_here(device)
@@ -31,8 +43,10 @@ def can_decode(model: ModelConfig, device: torch.device, *, needs_gradient: bool
         reason = f"settings that it knows, got {', '.join(unknown)}"
     elif has_embeddings:
         reason = "no embeddings, got some (backend eager or auto takes them)"
-    elif needs_gradient:
-        reason = "no gradient to be asked for (torch.no_grad)"
+    elif slopes:
+        reason = f"no gradient to be asked for by {', '.join(slopes)} (torch.no_grad)"
+    elif is_transformed:
+        reason = "no call inside a transform of torch.func"
     return _decide(model.inference.backend, reason)
 
 

@@ -14,12 +14,11 @@ from torchcrf_scan.fast.arrays import Decoded, Fitted, Scene, Settings, State
 from torchcrf_scan.fast.candidates import by_motion, with_targets
 from torchcrf_scan.fast.free_space import sweep_of
 from torchcrf_scan.fast.kept_candidates import kept_of
-from torchcrf_scan.fast.rounds import damp, has_settled, nearest_clusters, step, tables_of
-from torchcrf_scan.fast.selection import discard_vacuous
+from torchcrf_scan.fast.rounds import advance, label_nearest
 from torchcrf_scan.fast.static_features import association_pair, workspace
 from torchcrf_scan.fast.uncertainty import association_confidence, cluster_confidence, motion_covariance
 from torchcrf_scan.features.potentials import REFERENCE_UNIT
-from torchcrf_scan.inference.joint import MERGE_ROTATION, ROBUST_SHARE, SELECTION_ROUNDS
+from torchcrf_scan.inference.joint import MERGE_ROTATION, ROBUST_SHARE
 from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.nearest import boxes_of
 from torchcrf_scan.loops.pair import Pair, PairStart
@@ -136,9 +135,13 @@ def join(state: State, low: int, high: int) -> None:
 
 
 @entry
-def merge_alike(source: Array, state: State, scale: float) -> None:
-    """Merges clusters of equal motion into the one with the lower number, in place; `inference.joint.merge_alike`."""
+def merge_alike(source: Array, state: State, scale: float) -> Integers:
+    """Merges clusters of equal motion into the one with the lower number, in place; `inference.joint.merge_alike`.
+
+    Returns (J, 2) the lower and the higher number of each merged two, in order.
+    """
     C = len(state.motions)
+    joined, J = np.empty((C * C, 2), np.int64), 0
     labels, active = state.cluster.copy(), state.active.copy()
     count = np.zeros(C, np.int64)
     for i in range(len(labels)):
@@ -153,6 +156,9 @@ def merge_alike(source: Array, state: State, scale: float) -> None:
                 apart = max(mean_gap(source, a, b, labels, low), mean_gap(source, a, b, labels, high))
                 if apart < scale:
                     join(state, low, high)
+                    joined[J, 0], joined[J, 1] = low, high
+                    J += 1
+    return joined[:J].copy()
 
 
 @entry
@@ -160,23 +166,17 @@ def iterate(
     scene: Scene, state: State, start: PairStart, is_chosen: bool, fitted: Fitted, settings: Settings
 ) -> tuple[State, bool, int]:
     """The rounds: the last state, whether it has converged, and the number of rounds."""
-    tables = tables_of(scene, state, fitted.clustering)
-    state.cluster[:] = nearest_clusters(tables, scene.reach, state.association)
     kept = kept_of(len(scene.source), len(scene.target), len(state.motions), settings.candidates)
     work = workspace(len(scene.source), kept.index.shape[1])
     before = state
     converged, iterations = False, 0
+    if settings.iterations == 0:
+        label_nearest(scene, state, fitted)
     for done in range(settings.iterations):
-        if done > 0:
-            tables = tables_of(scene, state, fitted.clustering)
-        if done < SELECTION_ROUNDS and not is_chosen:
-            discard_vacuous(tables, state.active, start.log_odds, fitted.clustering, fitted.worth)
-        after = step(scene, state, tables, kept, work, fitted, settings)
-        if settings.stop_early:
-            damp(after, state, before)
+        after, _, _, is_settled = advance(scene, state, before, done, is_chosen, start.log_odds, kept, work, fitted, settings)
         before, state = state, after
         iterations += 1
-        converged = converged or has_settled(state, before, settings)
+        converged = converged or is_settled
         if settings.stop_early and converged:
             break
     return state, converged, iterations

@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.features.free_space import WIDEST_GAP
+from torchcrf_scan.features.free_space import SLACK_SHARE, SLACK_STEPS, WIDEST_GAP
 from torchcrf_scan.loops.circle import first_from, polar, rising_bearing, rising_turn, turn_between
 from torchcrf_scan.loops.jit import Array, kernel
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.search.free_space import range_slack
 
+LEAST_SLACK = 1e-6  # of `range_slack`
 USUAL_STEP = math.radians(0.5)  # of a scan with one point
 
 
@@ -49,25 +50,54 @@ def beam_after(sweep: Sweep, dx: float, dy: float) -> tuple[float, int]:
 
 
 @kernel
-def look(sweep: Sweep, x: float, y: float) -> tuple[float, float]:
-    """Free-space test of a point: degrees to which it is seen through and hidden, each from 0 to 1."""
+def beams_beside(sweep: Sweep, dx: float, dy: float) -> tuple[bool, float, float]:
+    """Whether a direction is in the field of view, and the lesser and the greater range of the beams beside it.
+
+    Where the beams are too far apart to tell, the lesser range is 0 and the greater infinite.
+    """
     N = len(sweep.ranges)
     if N == 0:
-        return 0.0, 0.0
-    dx, dy = x - sweep.origin[0], y - sweep.origin[1]
-    reach = math.sqrt(dx * dx + dy * dy)
+        return True, 0.0, np.inf
     bearing = rising_bearing(sweep.bearings[0], sweep.step / 2, dx, dy)
     after = first_from(sweep.bearings, bearing)
     if sweep.is_closed:
         left, right = (after - 1) % N, after % N
     else:
         if bearing > sweep.bearings[N - 1] + sweep.step / 2:
-            return 0.0, 1.0
+            return False, 0.0, np.inf
         left, right = max(after - 1, 0), min(after, N - 1)
     if left != right:
         beside = max(turn_between(sweep.bearings[left], bearing), turn_between(bearing, sweep.bearings[right]))
         if not beside < WIDEST_GAP * sweep.step:
-            return 0.0, 0.0
-    near, far = min(sweep.ranges[left], sweep.ranges[right]), max(sweep.ranges[left], sweep.ranges[right])
+            return True, 0.0, np.inf
+    return True, min(sweep.ranges[left], sweep.ranges[right]), max(sweep.ranges[left], sweep.ranges[right])
+
+
+@kernel
+def look(sweep: Sweep, x: float, y: float) -> tuple[float, float]:
+    """Free-space test of a point: degrees to which it is seen through and hidden, each from 0 to 1."""
+    dx, dy = x - sweep.origin[0], y - sweep.origin[1]
+    reach = math.sqrt(dx * dx + dy * dy)
+    is_inside, near, far = beams_beside(sweep, dx, dy)
+    if not is_inside:
+        return 0.0, 1.0
     slack = range_slack(reach, sweep.step, sweep.noise)
     return min(max((near - reach) / slack - 1, 0.0), 1.0), min(max((reach - far) / slack - 1, 0.0), 1.0)
+
+
+@kernel
+def look_slope(sweep: Sweep, x: float, y: float, to_seen: float, to_hidden: float) -> tuple[float, float]:
+    """Slope of a point from those of its free-space test."""
+    dx, dy = x - sweep.origin[0], y - sweep.origin[1]
+    reach = math.sqrt(dx * dx + dy * dy)
+    is_inside, near, far = beams_beside(sweep, dx, dy)
+    if not is_inside or reach == 0:
+        return 0.0, 0.0
+    slack = range_slack(reach, sweep.step, sweep.noise)
+    widening = SLACK_STEPS * sweep.step + SLACK_SHARE if slack > LEAST_SLACK else 0.0
+    before, beyond, slope = (near - reach) / slack, (reach - far) / slack, 0.0
+    if 1 < before < 2:
+        slope -= to_seen * (1 + before * widening) / slack
+    if 1 < beyond < 2:
+        slope += to_hidden * (1 - beyond * widening) / slack
+    return slope * dx / reach, slope * dy / reach

@@ -69,7 +69,7 @@ def prediction_of(answers: Sequence[Decoded], batch: ScanPairBatch) -> Predictio
     def pad(name: str, value: float, *shape: int) -> Tensor:
         return padded([getattr(answer, name) for answer in answers], (N, *shape), value)
 
-    log_association = [_with_states(answer.log_association, K + 1) for answer in answers]
+    log_association = [with_states(answer.log_association, K + 1) for answer in answers]
     return Prediction(
         association=pad("association", -1),
         cluster=pad("cluster", -1),
@@ -97,7 +97,7 @@ def by_beam(answer: Decoded, pair: ScanPair) -> PairPrediction:
     )
 
 
-def _with_states(log_beliefs: Array, states: int) -> Array:
+def with_states(log_beliefs: Array, states: int) -> Array:
     """(N, S) beliefs with more states, all impossible, before the last one."""
     some = log_beliefs.shape[1] - 1
     if some == states - 1:

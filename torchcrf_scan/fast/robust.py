@@ -14,6 +14,13 @@ def robust_square(error: float, per_scale: float) -> float:
 
 
 @kernel
+def robust_slope(error: float, per_scale: float) -> float:
+    """Derivative of `robust_square` by the error."""
+    ratio = error * per_scale
+    return -2 * ratio * per_scale if ratio * ratio <= KAPPA else 0.0
+
+
+@kernel
 def robust_weight(squared: float, scale: float) -> float:
     """Weight of a squared residual: 1 at 0, one half at the residual `scale`."""
     return 1 / (1 + squared / scale**2)

@@ -122,7 +122,7 @@ def _add_square(errors: Array, per_scale: float, share: float, channel: Array) -
 
 
 @kernel
-def _static_channels(errors: Array, per_local: Array) -> Array:
+def static_channels(errors: Array, per_local: Array) -> Array:
     """(11, P) channels L1..L11 of P pairs of points. errors: (18, P) differences of their descriptors; scratch."""
     channels = np.zeros((STATIC_CHANNELS, errors.shape[1]))
     for side in range(LENGTHS):
@@ -143,7 +143,7 @@ def _static_channels(errors: Array, per_local: Array) -> Array:
 
 
 @kernel
-def _differences(pair: AssociationPair, work: Workspace, points: Integers) -> Array:
+def differences(pair: AssociationPair, work: Workspace, points: Integers) -> Array:
     """(18, R K) of the descriptors of some source points (R,) and their candidates; 0 for those that are not real."""
     K = work.candidates.shape[1]
     errors = np.zeros((DESCRIPTORS, len(points) * K))
@@ -175,7 +175,7 @@ def _best_of_points(channels: Array, mask: Booleans, points: Integers) -> Array:
 def _update_points(model: AssociationModel, pair: AssociationPair, work: Workspace, points: Integers) -> None:
     """Updates the workspace of some source points (R,) from their candidates."""
     K = work.candidates.shape[1]
-    channels = _static_channels(_differences(pair, work, points), model.per_local)
+    channels = static_channels(differences(pair, work, points), model.per_local)
     best = _best_of_points(channels, work.mask, points)
     score, boosted, outlier = np.zeros(channels.shape[1]), np.zeros(channels.shape[1]), np.zeros(len(points))
     for c in range(STATIC_CHANNELS):

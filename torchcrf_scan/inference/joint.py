@@ -13,6 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.choices import MOTION_METRICS
 from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features import clustering
@@ -77,7 +78,7 @@ def decode(
 ) -> Prediction:
     """Labels and motions of a batch by the sweep schedule; differentiable through beliefs and, where soft, through motions."""
     last = settle(view, start, parameters, model, update)
-    return read_out(view, start, last.state, parameters, model.inference, last.converged, last.iterations)
+    return read_out(view.batch, start, last.state, parameters, model.inference, last.converged, last.iterations)
 
 
 def settle(view: PairView, start: Start, parameters: Parameters, model: ModelConfig, update: Update = update_in_turns) -> Round:
@@ -326,7 +327,7 @@ def join(state: State, chosen: Tensor, low: int, high: int) -> State:
 
 
 def read_out(
-    view: PairView,
+    batch: ScanPairBatch,
     start: Start,
     state: State,
     parameters: Parameters,
@@ -334,8 +335,8 @@ def read_out(
     converged: Tensor,
     iterations: Tensor,
 ) -> Prediction:
-    """The `Prediction` of a state, with confidences and covariances."""
-    batch, motions = view.batch, state.motions.value
+    """The `Prediction` of a state, with confidences and covariances. batch: in the unit of the features, as the state is."""
+    motions = state.motions.value
     geometry = (batch.source, batch.target, start.target_tangents)
     support = hard_support(*geometry, state.association, state.cluster, motions.shape[1])
     scale = ROBUST_SHARE * parameters.scales.cluster_distance

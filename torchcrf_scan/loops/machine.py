@@ -29,7 +29,8 @@ from torchcrf_scan.loops.background import Background
 PACKAGE = Path(__file__).parents[1]
 NAME = "machine"  # of every extension module: of one name, they share what pycc links to each
 PARTS: dict[str, tuple[str, ...]] = {  # the modules whose entries each extension holds; what takes longest comes first
-    "rounds": ("fast/decode.py", "fast/candidates.py"),
+    "rounds": ("fast/decode.py", "fast/rounds.py", "fast/candidates.py"),
+    "adjoint": ("adjoint/rounds.py",),
     "pool": ("search/pool.py", "search/background.py", "search/cold.py"),
     "survey": ("search/surface.py", "search/grid.py", "search/leftover.py", "search/hypotheses.py", "loops/shape.py"),
     "choice": ("search/hypothesis_features.py", "search/accept.py", "search/choose.py"),

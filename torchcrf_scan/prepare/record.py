@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning.hypothesis_fit import fit_hypothesis_score, view_pair
@@ -38,11 +39,13 @@ def record_layouts() -> dict[str, list[Layout]]:
 
 
 def answer_examples() -> None:
-    """Runs a cold pair, one with a guess, an empty scan, and the functions used by the fit of the movers' score."""
+    """Runs a cold pair, one with a guess, an empty scan, a gradient, and what fits the movers' score."""
     pairs = simulate_pairs(SimulatorConfig(beams=BEAMS), 2, 1, 0)
     pair = pairs[0]
     guess = ScanPair(pair.source, pair.target, pair.dt, initial_motion=np.array([0.0, 0.1, 0.0]))
     empty = Scan.from_ranges(np.full(BEAMS, np.inf), angle_min=-1.5, angle_increment=0.1)
     JointScanCRF.from_pretrained().match(pair.source, pair.target)
     JointScanCRF.from_pretrained("encoder", iterations=0).match_pairs([guess, ScanPair(empty, pair.target, pair.dt)])
+    soft = JointScanCRF.from_pretrained(motion_weights="soft", iterations=2)
+    soft(ScanPairBatch.collate(pairs)).motions.sum().backward()
     fit_hypothesis_score([view for k, pair in enumerate(pairs) for view in view_pair(pair, k, views=1)])

@@ -225,7 +225,7 @@ def sampled_motions(source: Array, target: Array, gate: float, picks: Integers) 
         for k in range(2):
             i = picks[h, k]
             here[k, 0], here[k, 1], there[k, 0], there[k, 1] = xs[i], ys[i], us[i], vs[i]
-        motions[h] = kabsch(here, there)
+        motions[h] = kabsch(here, there, np.ones(len(here)))
         by, count = transform_of(motions[h]), 0
         for i in range(len(xs)):
             x, y = transform(by, xs[i], ys[i])

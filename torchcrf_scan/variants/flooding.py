@@ -70,7 +70,7 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
         if stop_early and bool(converged.all()):
             break
     merged = joint.merge_alike(view, run.state, parameters.scales.cluster_distance)
-    return joint.read_out(view, start, merged, parameters, model.inference, converged, iterations)
+    return joint.read_out(view.batch, start, merged, parameters, model.inference, converged, iterations)
 
 
 class Flooding:
