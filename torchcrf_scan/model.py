@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.func import debug_unwrap
 
 from torchcrf_scan.adjoint import layer as adjoint
+from torchcrf_scan.adjoint.layer import Unrolled
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.choices import STARTS
 from torchcrf_scan.config import ModelConfig
@@ -23,7 +24,7 @@ from torchcrf_scan.fast.pairs import by_beam, decode_pairs, extras_of, predict
 from torchcrf_scan.features.learned import EMBEDDING_WEIGHTS, Embeddings, ExtraLogUnary, LearnedInputs
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import Scales, has_weight, live_weights
-from torchcrf_scan.inference import pseudo_likelihood
+from torchcrf_scan.inference import joint, pseudo_likelihood
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import ClusterPotential, Parameters
 from torchcrf_scan.inference.uncertainty import Calibration
@@ -35,6 +36,7 @@ from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 from torchcrf_scan.search.accept import score_of
 from torchcrf_scan.search.pairs import initialise, start_pairs
 from torchcrf_scan.search.score import HypothesisScore
+from torchcrf_scan.variants import sweep
 from torchcrf_scan.variants.register import BEGINNINGS, DECODERS, LIKELIHOODS
 
 BothEmbeddings = tuple[Tensor | None, Tensor | None]  # of source and target
@@ -193,19 +195,17 @@ class JointScanCRF(nn.Module):
         learned = self.learned_inputs(  # of the encoder and of the caller
             batch, start, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
         )
-        rounds = self._in_loops if self._suits_loops(batch, start, learned) else self._in_tensors  # the engine
+        rounds = self._in_loops if self._suits_loops(self.config, batch, start, learned) else self._in_tensors  # the engine
         return rounds(batch, start, learned)  # potentials, messages, motions, repeated until convergence
 
-    def _suits_loops(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> bool:
+    def _suits_loops(self, config: ModelConfig, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> bool:
         """Whether the loops can compute the rounds: on a CPU, for supported settings and gradients."""
         inputs = {"batch.source": batch.source, "batch.target": batch.target, "batch.initial_motion": batch.initial_motion}
         inputs |= {"start.motions": start.motions} | dict(self.boosters.named_parameters(prefix="boosters"))
         slopes = [name for name, tensor in inputs.items() if torch.is_grad_enabled() and tensor.requires_grad]
         has_embeddings = learned is not None and learned.embeddings is not None
         is_transformed = any(debug_unwrap(tensor) is not tensor for tensor in (*self.parameters(), *inputs.values()))
-        return can_decode(
-            self.config, batch.source.device, slopes=slopes, has_embeddings=has_embeddings, is_transformed=is_transformed
-        )
+        return can_decode(config, batch.source.device, slopes=slopes, has_embeddings=has_embeddings, is_transformed=is_transformed)
 
     def _in_loops(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
         """The rounds in machine code, one pair per thread, there and back."""
@@ -224,6 +224,21 @@ class JointScanCRF(nn.Module):
         decode = DECODERS[self.config.inference.schedule]
         found = decode(view, view.in_unit(start), self.fitted, self.config)
         return view.in_metres(found)  # metres
+
+    def unroll(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None, config: ModelConfig, last: int) -> Unrolled:
+        """The states after the last rounds, with a gradient: what losses on them are computed from.
+
+        Args:
+            start: metres. learned: output of `learned_inputs`. config: settings of the rounds, with the schedule `sweep`.
+            last: number of rounds, at most `iterations`.
+        """
+        if config.inference.iterations > 0 and self._suits_loops(config, batch, start, learned):
+            return adjoint.unroll(batch, start, self.fitted, config, learned, last)
+        view = self.view(batch, learned)
+        rounds = sweep.rounds(view, view.in_unit(start), self.fitted, config)[-last:]
+        distance = self.scales.cluster_distance
+        merged = [replace(done, state=joint.merge_alike(view, done.state, distance)) for done in rounds]
+        return Unrolled(view.batch, view.factor, merged)
 
     def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
         """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.

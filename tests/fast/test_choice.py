@@ -40,7 +40,11 @@ def test_loops_run_where_points_are_on_the_cpu_and_nothing_else_is_asked_for() -
         can_decode(ModelConfig(inference=InferenceConfig(backend="compiled")), CPU, has_embeddings=True)
 
 
-def test_a_gradient_needs_tensors() -> None:
-    assert not can_decode(ModelConfig(), CPU, needs_gradient=True)
-    with pytest.raises(ValueError, match="no gradient"):
-        can_decode(ModelConfig(inference=InferenceConfig(backend="compiled")), CPU, needs_gradient=True)
+def test_what_has_a_gradient_beside_weights_needs_tensors() -> None:
+    assert not can_decode(ModelConfig(), CPU, slopes=["batch.source"])
+    compiled = ModelConfig(inference=InferenceConfig(backend="compiled"))
+    with pytest.raises(ValueError, match=r"no gradient to be asked for by batch\.source"):
+        can_decode(compiled, CPU, slopes=["batch.source"])
+    assert not can_decode(ModelConfig(), CPU, is_transformed=True)
+    with pytest.raises(ValueError, match=r"no call inside a transform of torch\.func"):
+        can_decode(compiled, CPU, is_transformed=True)

@@ -14,13 +14,14 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import WORLDS
-from torchcrf_scan.fast import association, candidates, static_features
+from torchcrf_scan.fast import association, static_features
 from torchcrf_scan.features import potentials
 from torchcrf_scan.features.association import pairwise_features
 from torchcrf_scan.features.free_space import look
 from torchcrf_scan.inference.messages import chain_beliefs
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.loops import shape
+from torchcrf_scan.loops.candidates import by_motion
 from torchcrf_scan.loops.nearest import boxes_of
 
 PAIRS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pairs"
@@ -80,7 +81,7 @@ def assert_same_round(batch: ScanPairBatch, parameters: Parameters, count: int =
     log_cluster = normal(1, N, C + 1, seed=seed)
     work = None
     for motions in (MOTIONS, MOTIONS + 0.01):
-        index, mask, _ = candidates.by_motion(boxes_of(target), source, motions.numpy(), ACTIVE.numpy(), count)
+        index, mask, _ = by_motion(boxes_of(target), source, motions.numpy(), ACTIVE.numpy(), count)
         given = array(motions), array(ACTIVE), array(log_cluster[0])
         moved = potentials.registered_points(view.batch.source, motions[None], ACTIVE[None], log_cluster)
         found = association.registered_points(source, *given)

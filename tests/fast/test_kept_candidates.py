@@ -6,8 +6,8 @@ import torch
 from support import make_points, normal
 
 from torchcrf_scan.fast import kept_candidates
-from torchcrf_scan.fast.candidates import by_motion
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.loops.candidates import by_motion
 from torchcrf_scan.loops.nearest import boxes_of
 
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from torchcrf_scan.adjoint.chain import pull_max_marginals
 from torchcrf_scan.adjoint.motion import add_moved
 from torchcrf_scan.fast.arrays import Scene, State
 from torchcrf_scan.fast.association import (
@@ -43,6 +42,7 @@ from torchcrf_scan.fast.static_features import (
 from torchcrf_scan.features.extension import FARTHEST_EXCESS
 from torchcrf_scan.features.scales import GATE_WIDTH
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
+from torchcrf_scan.loops.pull_messages import pull_max_marginals
 from torchcrf_scan.names import STATIC_CHANNELS
 
 TOGETHER = 32  # source points whose channels are computed at once

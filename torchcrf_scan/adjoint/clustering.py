@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from torchcrf_scan.adjoint.chain import pull_max_marginals
 from torchcrf_scan.adjoint.motion import add_moved
 from torchcrf_scan.fast.arrays import Scene, State
 from torchcrf_scan.fast.clustering import ClusteringModel, Tables, distance, node_potentials, transition_potentials
@@ -14,6 +13,7 @@ from torchcrf_scan.fast.free_space import look, look_slope
 from torchcrf_scan.fast.robust import robust_slope, robust_square
 from torchcrf_scan.features.scales import GATE_WIDTH
 from torchcrf_scan.loops.jit import Array, Integers, kernel
+from torchcrf_scan.loops.pull_messages import pull_max_marginals
 from torchcrf_scan.loops.rigid import inverse, rotate, transform, transform_of
 from torchcrf_scan.names import CLUSTERING_DECISIONS, CLUSTERING_EDGE, CLUSTERING_FREE_SPACE, CLUSTERING_WEIGHTS, PAPERS_CLUSTER
 

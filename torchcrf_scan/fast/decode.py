@@ -11,7 +11,6 @@ import math
 import numpy as np
 
 from torchcrf_scan.fast.arrays import Decoded, Fitted, Scene, Settings, State
-from torchcrf_scan.fast.candidates import by_motion, with_targets
 from torchcrf_scan.fast.free_space import sweep_of
 from torchcrf_scan.fast.kept_candidates import kept_of
 from torchcrf_scan.fast.rounds import advance, label_nearest
@@ -19,6 +18,7 @@ from torchcrf_scan.fast.static_features import association_pair, workspace
 from torchcrf_scan.fast.uncertainty import association_confidence, cluster_confidence, motion_covariance
 from torchcrf_scan.features.potentials import REFERENCE_UNIT
 from torchcrf_scan.inference.joint import MERGE_ROTATION, ROBUST_SHARE
+from torchcrf_scan.loops.candidates import by_motion, with_targets
 from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.nearest import boxes_of
 from torchcrf_scan.loops.pair import Pair, PairStart

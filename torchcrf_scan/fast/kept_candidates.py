@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.fast.candidates import by_motion
+from torchcrf_scan.loops.candidates import by_motion
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.nearest import Boxes
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.loops.candidates import candidates_of
+from torchcrf_scan.loops.choice import is_readable
+from torchcrf_scan.loops.pair import array_of, padded
+from torchcrf_scan.loops.threads import for_each
 
 LARGEST_BLOCK = 2_000_000  # number of distances in memory at once
 
@@ -43,16 +48,44 @@ def by_motion(
 ) -> Candidates:
     """The `count` nearest target points under any active motion; all of them when count is 0 (dense).
 
+    By a search where the values can be read, else from all distances.
+
     Args:
         source_points: (B, N, 2); target_points: (B, M, 2); target_mask: (B, M); motions: (B, C, 3); active: (B, C).
-        count: K; time grows with B C N M.
+        count: K; from all distances time grows with B C N M.
     """
-    with torch.no_grad():  # a choice of states has no gradient
-        if torch.compiler.is_compiling():  # a compiled program serves any number of pairs, so the block size cannot depend on it
-            return _by_motion(source_points, target_points, target_mask, motions, active, count)
-        size = max(1, LARGEST_BLOCK // max(1, target_mask.numel()))
-        blocks = [_by_motion(part, target_points, target_mask, motions, active, count) for part in source_points.split(size, dim=1)]
-        return Candidates(*(torch.cat([getattr(block, f.name) for block in blocks], dim=1) for f in fields(Candidates)))
+    scans = source_points.detach(), target_points.detach(), target_mask  # a choice of states has no gradient
+    if target_mask.numel() > 0 and is_readable(*scans, motions, active):
+        return _by_search(*scans, motions, active, count)
+    return by_distance(*scans, motions, active, count)
+
+
+def _by_search(
+    source_points: Tensor, target_points: Tensor, target_mask: Tensor, motions: Tensor, active: Tensor, count: int
+) -> Candidates:
+    """`by_motion` pair by pair."""
+    B, N, M = *source_points.shape[:2], target_points.shape[1]
+    real = target_mask.sum(-1).tolist()
+    source, target, by = array_of(source_points), array_of(target_points), array_of(motions)
+    found = for_each(
+        lambda b: candidates_of(source[b], target[b, : real[b]].copy(), by[b], active[b].numpy().copy(), count), range(B)
+    )
+    index, mask, nearest = ([of[part] for of in found] for part in range(3))
+    K = M if count == 0 or count >= M else count
+    every = Candidates(padded(index, (N, K), 0), padded(mask, (N, K), False), torch.from_numpy(np.stack(nearest)))
+    return replace(every, index=every_target(source_points, target_mask)[0]) if K == M else every
+
+
+@torch.no_grad()
+def by_distance(
+    source_points: Tensor, target_points: Tensor, target_mask: Tensor, motions: Tensor, active: Tensor, count: int
+) -> Candidates:
+    """`by_motion` from the distances of all points, in tensors alone."""
+    if torch.compiler.is_compiling():  # a compiled program serves any number of pairs, so the block size cannot depend on it
+        return _by_motion(source_points, target_points, target_mask, motions, active, count)
+    size = max(1, LARGEST_BLOCK // max(1, target_mask.numel()))
+    blocks = [_by_motion(part, target_points, target_mask, motions, active, count) for part in source_points.split(size, dim=1)]
+    return Candidates(*(torch.cat([getattr(block, f.name) for block in blocks], dim=1) for f in fields(Candidates)))
 
 
 def _by_motion(

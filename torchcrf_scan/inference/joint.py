@@ -38,6 +38,7 @@ from torchcrf_scan.inference.selection import discard_vacuous
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters, Round, State
 from torchcrf_scan.inference.uncertainty import motion_covariance
+from torchcrf_scan.loops.choice import is_readable
 from torchcrf_scan.prediction import Prediction
 
 MERGE_ROTATION = 0.01  # radians
@@ -188,7 +189,7 @@ def update_clusters(
     possible = possible_clusters(state.motions.active, start.reach, batch.source.shape[1])
     extra = clustering_extra(view.learned, possible.shape[-1])
     potentials = clustering_potentials(local, pairwise, possible, parameters.clustering, extra)
-    log_cluster = chain_beliefs(*potentials, batch.source_mask, config.temperature)
+    log_cluster = chain_beliefs(*potentials, batch.source_mask, config.temperature, in_loops=config.backend != "eager")
     labels = cluster_labels(log_cluster.argmax(-1), log_cluster.shape[-1] - 1, batch.source_mask)
     return replace(state, log_cluster=log_cluster, cluster=labels)
 
@@ -207,7 +208,7 @@ def update_association(view: PairView, state: State, found: Candidates, paramete
     pairwise = pairwise_features(batch.source, batch.target, found.index, scales)
     extra = association_extra(view.learned, found.index)
     potentials = association_potentials(unary, pairwise, found.mask, parameters.association, extra)
-    log_association = chain_beliefs(*potentials, batch.source_mask, config.temperature)
+    log_association = chain_beliefs(*potentials, batch.source_mask, config.temperature, in_loops=config.backend != "eager")
     labels = association_labels(log_association.argmax(-1), found.index, batch.source_mask)
     return replace(state, candidates=found.index, candidate_mask=found.mask, log_association=log_association, association=labels)
 
@@ -307,6 +308,8 @@ def merge_alike(view: PairView, state: State, scale: Tensor) -> State:
         of_later = (gap * members[..., later].mT).sum(-1) / total[:, later].clamp(min=1)
         is_near = (rotation < MERGE_ROTATION) & (torch.maximum(of_low, of_later) < scale)
         alike = usable[:, low, None] & usable[:, later] & is_near
+        if is_readable(alike) and not bool(alike.any()):
+            continue
         for high in range(low + 1, C):
             state = join(state, alike[:, high - low - 1], low, high)
     return state

@@ -8,6 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcrf_scan.loops.chains import LogPartition, MaxMarginals
+from torchcrf_scan.loops.choice import has_operators
+
 LARGEST_BLOCKS = 4_000  # B S^3 above which the S-fold arithmetic of blocks costs more than the steps that it saves
 
 
@@ -101,6 +104,9 @@ def log_partition(log_unary: Tensor, log_pairwise: Tensor, temperature: float = 
     """
     if torch.compiler.is_compiling():
         return _total_by_halves(log_unary, log_pairwise, temperature)
+    if temperature == 1 and has_operators(log_unary):
+        total: Tensor = LogPartition.apply(log_unary, log_pairwise)[0]
+        return total
     if temperature > 0:
         return _LogPartition.apply(log_unary, log_pairwise, temperature)[0]
     return _running_totals(log_unary, log_pairwise, temperature)[-1]
@@ -160,12 +166,18 @@ def _share(log_scores: Tensor, total: Tensor, slope: Tensor, temperature: float)
     return slope.view(shape) * torch.exp((log_scores - possible) / temperature)
 
 
-def chain_beliefs(log_unary: Tensor, log_pairwise: Tensor, mask: Tensor, temperature: float = 0.0) -> Tensor:
+def chain_beliefs(
+    log_unary: Tensor, log_pairwise: Tensor, mask: Tensor, temperature: float = 0.0, *, in_loops: bool = False
+) -> Tensor:
     """Normalised log-beliefs (B, N, S): max-marginals at temperature 0, marginals at 1; padding is ignored (Eq. 3).
 
-    `log_softmax` of unary plus messages; at temperature 1 these are log marginal probabilities.
+    `log_softmax` of unary plus messages; at temperature 1 these are log marginal probabilities. in_loops: max-marginals on the
+    CPU are computed by an operator of `loops.chains`.
     """
     log_unary, log_pairwise = silence_padding(log_unary, log_pairwise, mask)
+    if in_loops and temperature == 0 and has_operators(log_unary):
+        beliefs: Tensor = MaxMarginals.apply(log_unary, log_pairwise)
+        return beliefs
     forward, backward = chain_messages(log_unary, log_pairwise, temperature)
     return normalise_beliefs(log_unary + forward + backward, temperature)
 

@@ -22,6 +22,8 @@ from torchcrf_scan.features.potentials import PairView, clustering_potentials, c
 from torchcrf_scan.inference.messages import log_partition, silence_padding
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters, State
+from torchcrf_scan.loops.chains import totals_without
+from torchcrf_scan.loops.choice import is_readable
 
 
 @torch.no_grad()
@@ -30,14 +32,15 @@ def discard_vacuous(view: PairView, start: Start, state: State, parameters: Para
     assert start.log_odds is not None
     chain = ConsideredChain.of(view, start, state, parameters, config)
     active = state.motions.active
+    ends_early = config.stop_early or is_readable(active)
     for _ in range(active.shape[1] - 1):
-        if config.stop_early and not bool(active[:, 1:].any()):
+        if ends_early and not bool(active[:, 1:].any()):
             break
         worth = parameters.potential(chain.evidence(active), start.log_odds)  # (B, C)
         is_mover = torch.arange(worth.shape[1], device=worth.device) > 0
         least, which = worth.masked_fill(~(active & is_mover), torch.inf).min(-1)
         is_vacuous = (which[:, None] == torch.arange(worth.shape[1], device=worth.device)) & (least < 0)[:, None]
-        if config.stop_early and not bool(is_vacuous.any()):
+        if ends_early and not bool(is_vacuous.any()):
             break
         active = active & ~is_vacuous
     return replace(state, motions=replace(state.motions, active=active))
@@ -56,7 +59,7 @@ class ConsideredChain:
     Attributes:
         view, start, parameters: as in `joint.decode`.
         at: moved points and their residuals. beside_local: (B, N, D, 8) features that do not depend on the set of clusters.
-        pairwise: (B, N-1, D, D, 8).
+        pairwise: (B, N-1, D, D, 8). in_loops: totals are computed by the loops where they can read tensors.
     """
 
     view: PairView
@@ -65,6 +68,7 @@ class ConsideredChain:
     at: clustering.Correspondence
     beside_local: Tensor
     pairwise: Tensor
+    in_loops: bool
 
     @classmethod
     def of(cls, view: PairView, start: Start, state: State, parameters: Parameters, config: InferenceConfig) -> ConsideredChain:
@@ -73,7 +77,8 @@ class ConsideredChain:
         found = find_candidates(view, motions.value, motions.active, config)
         at = clustering.correspond(batch.source, batch.target, motions.value, found.nearest, state.association)
         pairwise = clustering.pairwise_features(batch.source, at, scales)
-        return cls(view, start, parameters, at, contradictions(view, at, motions.value, scales), pairwise)
+        beside = contradictions(view, at, motions.value, scales)
+        return cls(view, start, parameters, at, beside, pairwise, config.backend != "eager")
 
     def evidence(self, active: Tensor) -> Tensor:
         """(B, C) log Z of the chain with all active clusters minus log Z without the cluster; 0 for inactive ones.
@@ -85,13 +90,19 @@ class ConsideredChain:
         mask = self.view.batch.source_mask
         B, C = active.shape
         local = torch.cat([clustering.local_features(self.at, active, self.parameters.scales), self.beside_local], dim=-1)
+        possible = possible_clusters(active, self.start.reach, mask.shape[1])  # (B, N, D)
+        extra = clustering_extra(self.view.learned, C + 1)
+        every = torch.ones_like(possible)
+        log_unary, log_pairwise = clustering_potentials(local, self.pairwise, every, self.parameters.clustering, extra)
+        if self.in_loops and is_readable(log_unary, log_pairwise):
+            potentials = silence_padding(log_unary.masked_fill(~possible, -torch.inf), log_pairwise, mask)
+            whole, without = totals_without(*potentials)
+            is_mover = active & (torch.arange(C) > 0)
+            return torch.where(is_mover, whole[:, None] - without[:, :-1], 0.0)
         is_other = ~torch.eye(C, dtype=torch.bool, device=active.device)
         is_other = torch.cat([torch.ones_like(is_other[:1]), is_other[1:]])  # row 0: all clusters; row k: without cluster k
         there = active & is_other[:, None]  # (C, B, C)
         possible = torch.stack([possible_clusters(row, self.start.reach, mask.shape[1]) for row in there])  # (C, B, N, D)
-        extra = clustering_extra(self.view.learned, C + 1)
-        every = torch.ones_like(possible[0])
-        log_unary, log_pairwise = clustering_potentials(local, self.pairwise, every, self.parameters.clustering, extra)
         totals = log_partition(
             *silence_padding(
                 log_unary.masked_fill(~possible, -torch.inf).flatten(0, 1),

@@ -22,14 +22,12 @@ from torch import Tensor
 from torchcrf_scan.batch import ScanPairBatch, Truth
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference import joint
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import State
 from torchcrf_scan.learning.objectives import Objective, start_of
 from torchcrf_scan.learning.portions import Portion
 from torchcrf_scan.learning.settings import Config, UnrolledConfig
 from torchcrf_scan.model import JointScanCRF
-from torchcrf_scan.variants import sweep
 
 LEAST_LIKENESS = 0.5  # least similarity of a match: half of the points, or a motion just within the tolerance
 TRAVEL_SHARE, LEAST_GAP = 0.15, 0.05  # tolerance of that motion: a share of the mover's travel; metres, on top of twice the noise
@@ -100,16 +98,16 @@ def unrolled_sums(
     if batch.truth is None:
         raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
     start = start or model.initialise(batch)
-    view = model.view(batch, model.learned_inputs(batch, start, **layer_inputs))
-    rounds = sweep.rounds(view, view.in_unit(start), model.fitted, unrolled_settings(model.config, config))
     weights = round_weights(config)
-    states = [joint.merge_alike(view, done.state, model.scales.cluster_distance) for done in rounds[-len(weights) :]]
-    slots = match_clusters(view.batch, states[-1], config.temperature)
+    learned = model.learned_inputs(batch, start, **layer_inputs)
+    done = model.unroll(batch, start, learned, unrolled_settings(model.config, config), len(weights))
+    states = [of.state for of in done.rounds]
+    slots = match_clusters(done.batch, states[-1], config.temperature)
     found = [
         {
-            "association": association_sum(view.batch, state, config).times(float(model.config.has_association)),
-            "cluster": cluster_sum(view.batch, state, slots, config).times(float(model.config.has_clusters)),
-            **motion_sums(view.batch, state, slots, config),
+            "association": association_sum(done.batch, state, config).times(float(model.config.has_association)),
+            "cluster": cluster_sum(done.batch, state, slots, config).times(float(model.config.has_clusters)),
+            **motion_sums(done.batch, state, slots, config),
         }
         for state in states
     ]

@@ -29,12 +29,12 @@ from torchcrf_scan.loops.background import Background
 PACKAGE = Path(__file__).parents[1]
 NAME = "machine"  # of every extension module: of one name, they share what pycc links to each
 PARTS: dict[str, tuple[str, ...]] = {  # the modules whose entries each extension holds; what takes longest comes first
-    "rounds": ("fast/decode.py", "fast/rounds.py", "fast/candidates.py"),
+    "rounds": ("fast/decode.py", "fast/rounds.py"),
     "adjoint": ("adjoint/rounds.py",),
     "pool": ("search/pool.py", "search/background.py", "search/cold.py"),
     "survey": ("search/surface.py", "search/grid.py", "search/leftover.py", "search/hypotheses.py", "loops/shape.py"),
     "choice": ("search/hypothesis_features.py", "search/accept.py", "search/choose.py"),
-    "answer": ("fast/uncertainty.py", "encoder/aligned_loops.py"),
+    "answer": ("loops/candidates.py", "loops/chains.py", "fast/uncertainty.py", "encoder/aligned_loops.py"),
 }
 COMPILER = ("prepare/extension.py", "prepare/record.py")  # its flags, and the types that it is given
 CALLER = ("loops/jit.py", "loops/machine.py")  # what calls machine code is not compiled into it

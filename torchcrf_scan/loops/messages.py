@@ -316,3 +316,83 @@ def log_partition(log_unary: Array, log_pairwise: Array) -> float:
     if len(states) == S:
         return float(_totals(log_unary, log_pairwise, none)[0])
     return float(_totals(_chosen_nodes(log_unary, states), _chosen_edges(log_pairwise, states), none)[0])
+
+
+@kernel
+def _backward_sums(nodes: Array, edges: Array, scale: Array) -> Array:
+    """(N, S) sums over all that comes after a node, in every state of it, over the scales (N,) of the forward sums."""
+    N, S = nodes.shape
+    sums = np.ones((N, S))
+    for i in range(N - 2, -1, -1):
+        for s in range(S):
+            total = 0.0
+            for t in range(S):
+                total += edges[i, s, t] * nodes[i + 1, t] * sums[i + 1, t]
+            sums[i, s] = total / scale[i + 1]
+    return sums
+
+
+@kernel
+def _sum_marginals(nodes: Array, edges: Array) -> tuple[float, Array, Array]:
+    """log Z and marginals of tables of factors. nodes: (N, S), N >= 1; edges: (N-1, S, S); no sum may underflow."""
+    N, S = nodes.shape
+    sums, scale, total = nodes.copy(), np.empty(N), 0.0
+    for i in range(N):
+        if i > 0:
+            for t in range(S):
+                sums[i, t] = 0.0
+                for s in range(S):
+                    sums[i, t] += sums[i - 1, s] * edges[i - 1, s, t]
+                sums[i, t] *= nodes[i, t]
+        scale[i] = sums[i].sum()
+        if scale[i] == 0:
+            return -np.inf, np.zeros((N, S)), np.zeros_like(edges)
+        total += math.log(scale[i])
+        for t in range(S):
+            sums[i, t] /= scale[i]
+    after, of_edges = _backward_sums(nodes, edges, scale), np.empty_like(edges)
+    for i in range(N - 1):
+        for s in range(S):
+            for t in range(S):
+                of_edges[i, s, t] = sums[i, s] * edges[i, s, t] * nodes[i + 1, t] * after[i + 1, t] / scale[i + 1]
+    for i in range(N):
+        for s in range(S):
+            sums[i, s] *= after[i, s]
+    return total, sums, of_edges
+
+
+@kernel
+def _slow_sum_marginals(log_unary: Array, log_pairwise: Array) -> tuple[float, Array, Array]:
+    """The same in the log domain throughout: always accurate, but slow."""
+    N, S = log_unary.shape
+    ahead, after, terms = log_unary.copy(), np.zeros((N, S)), np.empty(S)
+    for i in range(1, N):
+        for t in range(S):
+            for s in range(S):
+                terms[s] = ahead[i - 1, s] + log_pairwise[i - 1, s, t]
+            ahead[i, t] += log_sum(terms)
+    for i in range(N - 2, -1, -1):
+        for s in range(S):
+            for t in range(S):
+                terms[t] = log_pairwise[i, s, t] + log_unary[i + 1, t] + after[i + 1, t]
+            after[i, s] = log_sum(terms)
+    total, of_nodes, of_edges = log_sum(ahead[N - 1]), np.zeros((N, S)), np.zeros_like(log_pairwise)
+    for i in range(N if total > -np.inf else 0):
+        for s in range(S):
+            of_nodes[i, s] = math.exp(ahead[i, s] + after[i, s] - total)
+            for t in range(S if i < N - 1 else 0):
+                score = ahead[i, s] + log_pairwise[i, s, t] + log_unary[i + 1, t] + after[i + 1, t]
+                of_edges[i, s, t] = math.exp(score - total)
+    return total, of_nodes, of_edges
+
+
+@kernel
+def sum_marginals(log_unary: Array, log_pairwise: Array) -> tuple[float, Array, Array]:
+    """log Z at temperature 1, and the marginals (N, S) of nodes and (N-1, S, S) of edges. Arguments as in `max_marginals`."""
+    if len(log_unary) == 0:
+        return 0.0, np.zeros_like(log_unary), np.zeros_like(log_pairwise)
+    nodes, edges, offset, is_safe = _tables(log_unary, log_pairwise)
+    if not is_safe:
+        return _slow_sum_marginals(log_unary, log_pairwise)
+    total, of_nodes, of_edges = _sum_marginals(nodes, edges)
+    return total + offset, of_nodes, of_edges

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
-from torchcrf_scan.loops.nearest import RUN, Boxes, box_distance, nearest
+from torchcrf_scan.loops.nearest import RUN, Boxes, box_distance, boxes_of, nearest
 from torchcrf_scan.loops.rigid import apply
 
 
@@ -137,6 +137,14 @@ def by_motion(boxes: Boxes, source: Array, motions: Array, active: Booleans, cou
             closest[i, which[a]] = guess[a]
             guess[a] = min(guess[a] + 1, M - 1)
     return index, mask, closest
+
+
+@entry
+def candidates_of(
+    source: Array, target: Array, motions: Array, active: Booleans, count: int
+) -> tuple[Integers, Booleans, Integers]:
+    """`by_motion` of one pair. source: (N, 2); target: (M, 2)."""
+    return by_motion(boxes_of(target), source, motions, active, count)
 
 
 @entry

@@ -11,8 +11,8 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import WORLDS
-from torchcrf_scan.fast.candidates import by_motion, with_targets
 from torchcrf_scan.features import candidates
+from torchcrf_scan.loops.candidates import by_motion, with_targets
 from torchcrf_scan.loops.nearest import boxes_of
 
 PAIRS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pairs"

@@ -81,9 +81,11 @@ def pull_max_marginals(log_unary: Array, log_pairwise: Array, log_beliefs: Array
     """Slopes of `max_marginals`: (N, S) of the potentials of nodes and (N-1, S, S) of edges.
 
     Args:
-        log_unary: (N, S), N >= 1. log_pairwise: (N-1, S, S). log_beliefs: (N, S) the max-marginals. slopes: (N, S) of these.
+        log_unary: (N, S). log_pairwise: (N-1, S, S). log_beliefs: (N, S) the max-marginals. slopes: (N, S) of these.
     """
     own = pull_softmax(log_beliefs, slopes)
+    if len(own) == 0:
+        return own, np.zeros_like(log_pairwise)
     nodes, edges = own.copy(), np.zeros_like(log_pairwise)
     _pull_direction(log_unary, log_pairwise, own, True, nodes, edges)
     _pull_direction(log_unary, log_pairwise, own, False, nodes, edges)
