@@ -236,8 +236,8 @@ class JointScanCRF(nn.Module):
             return adjoint.unroll(batch, start, self.fitted, config, learned, last)
         view = self.view(batch, learned)
         rounds = sweep.rounds(view, view.in_unit(start), self.fitted, config)[-last:]
-        distance = self.scales.cluster_distance
-        merged = [replace(done, state=joint.merge_alike(view, done.state, distance)) for done in rounds]
+        distance, looks = self.scales.cluster_distance, config.inference.backend != "eager"
+        merged = [replace(done, state=joint.merge_alike(view, done.state, distance, looks=looks)) for done in rounds]
         return Unrolled(view.batch, view.factor, merged)
 
     def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:

@@ -481,7 +481,8 @@ def no_looking_at_values() -> Iterator[None]:
 def test_the_loss_never_looks_at_a_value(movers: str, coupling: str) -> None:
     batch, start = labelled_scene(10, 2)
     model = make_model(coupling=coupling, smooth=0.2)
-    model.config = replace(model.config, inference=replace(model.config.inference, movers=movers, candidates=3, clusters=4))
+    settings = {"movers": movers, "candidates": 3, "clusters": 4, "backend": "eager"}
+    model.config = replace(model.config, inference=replace(model.config.inference, **settings))
     odds = torch.tensor([[torch.inf, 1.0, -torch.inf]]).double()
     with no_looking_at_values():
         loss = unrolled_loss(model, batch, UnrolledConfig(deep_supervision=0.5), replace(start, log_odds=odds))["total"]

@@ -22,7 +22,6 @@ from torchcrf_scan.fast.arrays import Fitted, Scene, Settings, State, fitted_of,
 from torchcrf_scan.fast.decode import certain, first_state, merge_alike, scene_of
 from torchcrf_scan.fast.pairs import Extra, extras_of, with_states
 from torchcrf_scan.fast.rounds import Done, caches_of, do_round
-from torchcrf_scan.fast.static_features import workspace
 from torchcrf_scan.features.learned import LearnedInputs
 from torchcrf_scan.inference import joint, state
 from torchcrf_scan.inference.motion import Motions
@@ -133,8 +132,8 @@ def pull_pair(done: PairRounds, slopes: list[Slopes], fitted: Fitted, settings: 
     """Slopes of the inputs of one pair. slopes: of the beliefs and motions of the answers, in order."""
     assert done.scene is not None
     inputs = no_inputs(len(done.scene.source))
-    N, K = done.rounds[-1].after.candidates.shape
-    work, back = workspace(N, K), no_slopes(done.rounds[-1].after)
+    last = done.rounds[-1].after
+    work, back = caches_of(done.scene, len(last.motions), settings.candidates).work, no_slopes(last)
     given = dict(zip(range(len(done.rounds) - 1, -1, -1), zip(slopes[::-1], done.answers[::-1], strict=True), strict=False))
     for number in range(len(done.rounds) - 1, -1, -1):
         if number in given:

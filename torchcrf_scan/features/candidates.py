@@ -44,18 +44,24 @@ def squared_distances(moved: Tensor, target_points: Tensor, target_mask: Tensor)
 
 
 def by_motion(
-    source_points: Tensor, target_points: Tensor, target_mask: Tensor, motions: Tensor, active: Tensor, count: int
+    source_points: Tensor,
+    target_points: Tensor,
+    target_mask: Tensor,
+    motions: Tensor,
+    active: Tensor,
+    count: int,
+    *,
+    in_loops: bool = True,
 ) -> Candidates:
     """The `count` nearest target points under any active motion; all of them when count is 0 (dense).
 
-    By a search where the values can be read, else from all distances.
-
     Args:
         source_points: (B, N, 2); target_points: (B, M, 2); target_mask: (B, M); motions: (B, C, 3); active: (B, C).
-        count: K; from all distances time grows with B C N M.
+        count: K.
+        in_loops: by a search where the values can be read; otherwise from all distances, in time B C N M.
     """
     scans = source_points.detach(), target_points.detach(), target_mask  # a choice of states has no gradient
-    if target_mask.numel() > 0 and is_readable(*scans, motions, active):
+    if in_loops and target_mask.numel() > 0 and is_readable(*scans, motions, active):
         return _by_search(*scans, motions, active, count)
     return by_distance(*scans, motions, active, count)
 

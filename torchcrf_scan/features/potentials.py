@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol, Self, TypeVar, cast
 
 import torch
@@ -243,14 +244,13 @@ def find_candidates(view: PairView, motions: Tensor, active: Tensor, config: Inf
     motions: (B, C, 3), active: (B, C): candidates are the nearest under these (`motion`); otherwise used for `nearest` only.
     """
     batch = view.batch
-    scans = (batch.source, batch.target, batch.target_mask)
+    near = partial(candidates.by_motion, batch.source, batch.target, batch.target_mask, in_loops=config.backend != "eager")
     if config.candidate_search == "motion" or config.candidates == 0:
-        return candidates.by_motion(*scans, motions, active, config.candidates)
-    nearest = candidates.by_motion(*scans, motions, active, 1).nearest
+        return near(motions, active, config.candidates)
+    nearest = near(motions, active, 1).nearest
     if config.candidate_search == "position":
         guess = batch.initial_motion[:, None]
-        found = candidates.by_motion(*scans, guess, torch.ones_like(active[:, :1]), config.candidates)
-        return replace(found, nearest=nearest)
+        return replace(near(guess, torch.ones_like(active[:, :1]), config.candidates), nearest=nearest)
     index, mask, _ = most_alike(view, config.candidates)
     return Candidates(index, mask, nearest)
 

@@ -85,7 +85,8 @@ def decode(
 def settle(view: PairView, start: Start, parameters: Parameters, model: ModelConfig, update: Update = update_in_turns) -> Round:
     """State of B pairs after the last round, with clusters of equal motion merged."""
     last = rounds(view, start, parameters, model, update)[-1]
-    return replace(last, state=merge_alike(view, last.state, parameters.scales.cluster_distance))
+    looks = model.inference.backend != "eager"
+    return replace(last, state=merge_alike(view, last.state, parameters.scales.cluster_distance, looks=looks))
 
 
 def rounds(
@@ -288,11 +289,11 @@ def has_settled(after: State, before: State, config: InferenceConfig) -> Tensor:
     return same_labels(after, before) & still
 
 
-def merge_alike(view: PairView, state: State, scale: Tensor) -> State:
+def merge_alike(view: PairView, state: State, scale: Tensor, *, looks: bool = False) -> State:
     """Merges clusters with equal motions into the one with the lower number, after the last round only (spec 7.5).
 
     Motions are equal if their rotations differ by less than 0.01 rad and, over the points of both, their translations by less than
-    `scale`. A cluster without points is not merged.
+    `scale`. A cluster without points is not merged. looks: where values can be read, nothing is computed for what is not merged.
     """
     motions = replace(state.motions, value=state.motions.value.detach())  # the decision to merge has no gradient
     C = motions.value.shape[1]
@@ -308,7 +309,7 @@ def merge_alike(view: PairView, state: State, scale: Tensor) -> State:
         of_later = (gap * members[..., later].mT).sum(-1) / total[:, later].clamp(min=1)
         is_near = (rotation < MERGE_ROTATION) & (torch.maximum(of_low, of_later) < scale)
         alike = usable[:, low, None] & usable[:, later] & is_near
-        if is_readable(alike) and not bool(alike.any()):
+        if looks and is_readable(alike) and not bool(alike.any()):
             continue
         for high in range(low + 1, C):
             state = join(state, alike[:, high - low - 1], low, high)

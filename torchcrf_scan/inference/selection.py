@@ -32,7 +32,7 @@ def discard_vacuous(view: PairView, start: Start, state: State, parameters: Para
     assert start.log_odds is not None
     chain = ConsideredChain.of(view, start, state, parameters, config)
     active = state.motions.active
-    ends_early = config.stop_early or is_readable(active)
+    ends_early = config.stop_early or (config.backend != "eager" and is_readable(active))
     for _ in range(active.shape[1] - 1):
         if ends_early and not bool(active[:, 1:].any()):
             break
