@@ -128,7 +128,7 @@ class JointScanCRF(nn.Module):
         start: motions under which the encoder aligns the batch; None: the encoder is not applied.
         """
         extra, embeddings = extra_log_unary or ExtraLogUnary(), (source_embedding, target_embedding)
-        self.check(batch, start)
+        self._check(batch, start)
         check_inputs(batch, extra, embeddings)
         if self.encoder is not None and start is not None:
             extra, embeddings = self._with_encoder(self.encoder, batch, start, extra, embeddings)
@@ -161,7 +161,7 @@ class JointScanCRF(nn.Module):
         weights = self.association_weights["embedding"], self.association_weights["embedding_data"]
         return Embeddings.of(source, target, (batch.source_mask, batch.target_mask), kind, weights)
 
-    def check(self, batch: ScanPairBatch, start: Start | None = None) -> None:
+    def _check(self, batch: ScanPairBatch, start: Start | None = None) -> None:
         """Raises ValueError unless batch and start fit each other in shape, and the model in dtype and device."""
         check_batch(batch, self.association_weights["sequence"])
         if start is not None:
@@ -169,7 +169,7 @@ class JointScanCRF(nn.Module):
 
     def initialise(self, batch: ScanPairBatch) -> Start:
         """InitialiseRT: initial motions of the batch (Algorithm 1, line 1). No gradient."""
-        self.check(batch)
+        self._check(batch)
         found = initialise(batch, score_of(self.hypothesis_score), self.config.motions)
         begin = BEGINNINGS.get(self.config.start)
         if begin is None:
