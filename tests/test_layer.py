@@ -312,7 +312,7 @@ def test_compiled_code_does_not_take_embeddings_and_says_so() -> None:
         make_model(**settings_)(batch, start, **embeddings())
     smooth = JointScanCRF(ModelConfig(features=FeatureConfig(smooth=0.1), inference=InferenceConfig(backend="compiled")))
     with torch.no_grad(), pytest.raises(ValueError, match=r"backend: expected for compiled .* smooth: 0\.1"):
-        smooth(batch, start)
+        smooth.double()(batch, start)
 
 
 def test_where_compiled_code_would_answer_tensors_do() -> None:

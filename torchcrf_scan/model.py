@@ -28,6 +28,7 @@ from torchcrf_scan.inference import joint, pseudo_likelihood
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import ClusterPotential, Parameters
 from torchcrf_scan.inference.uncertainty import Calibration
+from torchcrf_scan.inputs import check_batch, check_inputs, check_plugins, check_start
 from torchcrf_scan.loops.pair import pair_of_scans
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.prediction import Prediction
@@ -131,12 +132,13 @@ class JointScanCRF(nn.Module):
         start: motions under which the encoder aligns the batch; None: the encoder is not applied.
         """
         extra, embeddings = extra_log_unary or ExtraLogUnary(), (source_embedding, target_embedding)
+        self._check(batch, start)
+        check_inputs(batch, extra, embeddings)
         if self.encoder is not None and start is not None:
             extra, embeddings = self._with_encoder(self.encoder, batch, start, extra, embeddings)
         if all(value is None for value in (*embeddings, extra.outlier, extra.moving)):
             return None
         self.config.require("takes_extras", "with embeddings or extra_log_unary")
-        check_inputs(batch, extra, embeddings)
         outlier, moving = (None if of is None else torch.where(batch.source_mask, of, 0.0) for of in (extra.outlier, extra.moving))
         return LearnedInputs(self._embeddings(batch, *embeddings), outlier, moving)
 
@@ -163,8 +165,15 @@ class JointScanCRF(nn.Module):
         weights = self.association_weights["embedding"], self.association_weights["embedding_data"]
         return Embeddings.of(source, target, (batch.source_mask, batch.target_mask), kind, weights)
 
+    def _check(self, batch: ScanPairBatch, start: Start | None = None) -> None:
+        """Raises ValueError unless batch and start fit each other in shape, and the model in dtype and device."""
+        check_batch(batch, self.association_weights["sequence"])
+        if start is not None:
+            check_start(start, batch)
+
     def initialise(self, batch: ScanPairBatch) -> Start:
         """InitialiseRT: initial motions of the batch (Algorithm 1, line 1). No gradient."""
+        self._check(batch)
         found = initialise(batch, score_of(self.hypothesis_score), self.config.motions)
         begin = BEGINNINGS.get(self.config.start)
         if begin is None:
@@ -190,6 +199,9 @@ class JointScanCRF(nn.Module):
             source_embedding, target_embedding: (B, N, C), (B, M, C) of the points, for a model with `features.embedding`: similar
                 ones are associated. InitialiseRT does not use them. None: the term is left out.
             extra_log_unary: (B, N) learned log potentials of outliers and of moving points.
+
+        Raises:
+            ValueError: an input whose shape, dtype or device does not fit the batch or the model.
         """
         start = start or self.initialise(batch)  # InitialiseRT
         learned = self.learned_inputs(  # of the encoder and of the caller
@@ -240,18 +252,39 @@ class JointScanCRF(nn.Module):
         merged = [replace(done, state=joint.merge_alike(view, done.state, distance, looks=looks)) for done in rounds]
         return Unrolled(view.batch, view.factor, merged)
 
-    def pseudo_log_likelihood(self, batch: ScanPairBatch, plugins: pseudo_likelihood.PlugIns | None = None) -> Tensor:
+    def pseudo_log_likelihood(
+        self,
+        batch: ScanPairBatch,
+        plugins: pseudo_likelihood.PlugIns | None = None,
+        *,
+        start: Start | None = None,
+        source_embedding: Tensor | None = None,
+        target_embedding: Tensor | None = None,
+        extra_log_unary: ExtraLogUnary | None = None,
+    ) -> Tensor:
         """(B,) log pseudo-likelihood of the annotation: every label given its true neighbours (spec 6.2). Needs `batch.truth`.
 
         Args:
             plugins: motions and labels taken as observed in the features, in the unit of `view`; None: the annotated ones.
+            start: motions under which the model's encoder aligns the batch, and nothing else; None: from InitialiseRT.
+            source_embedding, target_embedding, extra_log_unary: as in `forward`.
+
+        Raises:
+            ValueError: no annotation, or an input that does not fit as in `forward`.
         """
         if batch.truth is None:
             raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
-        view = self.view(batch)
+        if self.encoder is not None:
+            start = start or self.initialise(batch)
+        learned = self.learned_inputs(
+            batch, start, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
+        )
+        if plugins is not None:
+            check_plugins(plugins, batch)
+        view = self.view(batch, learned)
         plugins = plugins or pseudo_likelihood.true_plugins(view.batch, self.config.inference.clusters - 1)
         if not self.config.has_clusters:
-            plugins = pseudo_likelihood.for_background_alone(plugins)
+            plugins = pseudo_likelihood.for_background_alone(plugins, view.batch)
         return LIKELIHOODS[self.config.coupling](view, plugins, self.fitted, self.config)
 
     @torch.no_grad()
@@ -318,17 +351,6 @@ class JointScanCRF(nn.Module):
     def embedding_state(self) -> dict[str, Tensor]:
         """The part of the model's state that exists only with embeddings."""
         return {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in EMBEDDING_WEIGHTS}
-
-
-def check_inputs(batch: ScanPairBatch, extra: ExtraLogUnary, embeddings: BothEmbeddings) -> None:
-    """Raises ValueError if an optional input of `forward` does not match the batch in shape."""
-    given = {"source_embedding": embeddings[0], "target_embedding": embeddings[1]}
-    given |= {"extra_log_unary.outlier": extra.outlier, "extra_log_unary.moving": extra.moving}
-    for name, value in given.items():
-        points = batch.target_mask if name == "target_embedding" else batch.source_mask
-        wanted = (*points.shape, "C") if name.endswith("embedding") else tuple(points.shape)
-        if value is not None and (value.dim() != len(wanted) or value.shape[:2] != points.shape):
-            raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
 
 
 class MatchingCRF(JointScanCRF):

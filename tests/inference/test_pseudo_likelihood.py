@@ -16,12 +16,21 @@ from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.candidates import with_targets
-from torchcrf_scan.features.potentials import Boosters, PairView
+from torchcrf_scan.features.potentials import (
+    AssociationStates,
+    Boosters,
+    PairView,
+    association_unary,
+    find_candidates,
+    registered_points,
+)
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.pseudo_likelihood import (
+    Chain,
     Design,
     PlugIns,
+    association_chain,
     association_design,
     at_true_neighbours,
     clustering_design,
@@ -31,7 +40,7 @@ from torchcrf_scan.inference.pseudo_likelihood import (
 )
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
-from torchcrf_scan.names import CLUSTERING_UNARY
+from torchcrf_scan.names import CLUSTERING_UNARY, LOCAL_CHANNELS
 
 N, M, C = 6, 5, 3
 DENSE = InferenceConfig(candidates=0)
@@ -254,6 +263,16 @@ def test_movers_without_a_slot_are_unknown() -> None:
     assert plugins.motions.shape == (1, 1, 3)
 
 
+def test_movers_without_a_slot_do_not_train_the_association_chain() -> None:
+    """Their registered channel would be taken under the background's motion."""
+    batch, scales, boosters, weights = tiny(), Scales().double(), Boosters(1).double(), normal(23)
+    chain = association_chain(PairView.of(batch), true_plugins(batch, 1), scales, boosters, DENSE)
+    assert chain.known.tolist() == [[True, True, True, False, False, True]]
+    without = annotated(batch, known=CLUSTER < 1)
+    expected = association_chain(PairView.of(without), true_plugins(without, 1), scales, boosters, DENSE)
+    assert_close(chain.design().log_likelihood(weights), expected.design().log_likelihood(weights))
+
+
 def test_movers_without_a_motion_are_unknown() -> None:
     batch = tiny()
     assert batch.truth is not None
@@ -309,6 +328,51 @@ def test_without_truth_there_is_none() -> None:
         JointScanCRF().pseudo_log_likelihood(tiny().without_truth())
 
 
+# --- the true target among the candidates -------------------------------------------------------------------------------------
+
+FAR = ASSOCIATION.roll(2, dims=1)  # annotated targets that are not among the nearest
+
+
+def fitted() -> tuple[Scales, Boosters]:
+    """Wide scales and random stumps."""
+    scales, boosters = Scales().double(), Boosters(9).double()
+    scales.local.mul_(10)
+    random_stumps(boosters.data, 3)
+    random_stumps(boosters.outlier, 4)
+    return scales, boosters
+
+
+def few_candidates(batch: ScanPairBatch) -> tuple[Chain, Tensor, AssociationStates]:
+    """The association chain with two candidates, its outlier states (B, N, 19) and candidates as inference has them."""
+    (scales, boosters), config = fitted(), InferenceConfig(candidates=2)
+    view, plugins = PairView.of(batch), replace(plugins_of(tiny()), motions=MOTIONS[None])
+    found = find_candidates(view, plugins.motions, plugins.active, config)
+    states = AssociationStates.of(view, found.index, found.mask, scales, boosters)
+    one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), C + 1).double()
+    moved = registered_points(batch.source, plugins.motions, plugins.active, one_hot)
+    outlier = association_unary(view, states, moved, scales, boosters)[:, :, -1]
+    return association_chain(view, plugins, scales, boosters, config), outlier, states
+
+
+def test_the_outlier_booster_sees_the_candidates_that_inference_finds() -> None:
+    chain, outlier, states = few_candidates(annotated(tiny(), association=FAR))
+    is_found = (states.candidates == FAR[..., None]).any(-1)
+    assert (~is_found & (FAR >= 0)).sum() >= 2
+    assert_close(chain.unary[:, :, -1], outlier)
+    other, _, _ = few_candidates(tiny())
+    assert_close(other.unary[:, :, -1], chain.unary[:, :, -1])
+    assert outlier[..., len(LOCAL_CHANNELS) + 1].unique().numel() > 1
+
+
+def test_the_inlier_states_have_the_features_of_their_targets() -> None:
+    chain, _, _ = few_candidates(annotated(tiny(), association=FAR))
+    plugins = replace(plugins_of(tiny()), motions=MOTIONS[None])
+    dense = association_chain(PairView.of(annotated(tiny(), association=FAR)), plugins, *fitted(), DENSE)
+    for i in torch.arange(N)[FAR[0] >= 0].tolist():
+        own = chain.unary[0, i, chain.label[0, i], : len(LOCAL_CHANNELS) + 1]
+        assert_close(own, dense.unary[0, i, FAR[0, i], : len(LOCAL_CHANNELS) + 1])
+
+
 # --- parts --------------------------------------------------------------------------------------------------------------------
 
 
@@ -343,13 +407,21 @@ def test_one_node_has_no_edges() -> None:
 
 
 def test_matching_moves_everything_with_the_background() -> None:
-    plugins = for_background_alone(true_plugins(tiny(), C))
+    plugins = for_background_alone(true_plugins(tiny(), C), tiny())
     assert plugins.motions.shape == (1, 1, 3)
     assert (plugins.cluster == 0).all()
     assert plugins.label.tolist() == [[0, 0, -1, 0, 0, 0]]
 
 
+def test_matching_needs_no_slot_for_a_mover() -> None:
+    wide, narrow = (for_background_alone(true_plugins(tiny(), clusters), tiny()) for clusters in (C, 1))
+    assert narrow.known.all()
+    for name in ("motions", "active", "cluster", "label", "known"):
+        assert torch.equal(getattr(narrow, name), getattr(wide, name)), name
+
+
 def test_matching_is_scored_as_it_is_fitted() -> None:
     batch, model = tiny(), MatchingCRF().double()
-    expected = model.pseudo_log_likelihood(batch, for_background_alone(true_plugins(model.view(batch).batch, C)))
+    own = model.view(batch).batch
+    expected = model.pseudo_log_likelihood(batch, for_background_alone(true_plugins(own, C), own))
     assert_close(model.pseudo_log_likelihood(batch).detach(), expected.detach())

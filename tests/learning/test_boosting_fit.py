@@ -91,6 +91,28 @@ def test_wrong_targets_are_never_the_true_one_or_its_neighbour(count: int) -> No
     assert usable.float().mean() > 0.6
 
 
+def test_wrong_targets_of_an_outlier_are_anywhere_and_the_nearest() -> None:
+    N, M, count = 400, 60, 10
+    moved, target = make_points(N)[None], make_points(M, 9)[None]
+    target_mask = torch.arange(M)[None] < 50
+    index, usable = sample_targets(torch.full((1, N), -1), moved, target, target_mask, count, generator(0))
+    assert usable.all()
+    assert torch.bincount(index[..., :5].flatten(), minlength=50).min() > 10  # of 40 expected
+    nearest = torch.cdist(moved[0], target[0, :50]).argsort(-1)[:, :5]
+    assert torch.equal(index[0, :, 5:].sort(-1).values, nearest.sort(-1).values)
+
+
+@pytest.mark.parametrize("count", [10, 40])
+def test_wrong_targets_of_an_outlier_in_a_short_scan(count: int) -> None:
+    target_mask = torch.tensor([[True, True, True, False]])
+    index, usable = sample_targets(
+        torch.full((1, 6), -1), make_points(6)[None], make_points(4, 1)[None], target_mask, count, generator(0)
+    )
+    assert (index[usable] < 3).all()
+    near = index[0, :, count // 2 :][usable[0, :, count // 2 :]].view(6, 3)
+    assert near.sort(-1).values.tolist() == [[0, 1, 2]] * 6
+
+
 def test_wrong_targets_of_a_tiny_scan() -> None:
     truth = torch.zeros(1, 3, dtype=torch.int64)
     index, usable = sample_targets(

@@ -6,9 +6,15 @@ from itertools import pairwise as pairwise_of
 import oracles
 import pytest
 import torch
-from support import assert_close
+from support import assert_close, normal
 
-from torchcrf_scan.inference.pseudo_likelihood import Chain
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.config import InferenceConfig
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.features.potentials import Boosters, PairView
+from torchcrf_scan.features.scales import Scales
+from torchcrf_scan.inference.pseudo_likelihood import Chain, association_chain, clustering_chain, true_plugins
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.learning.weights_fit import fit_chain, stack
 
@@ -45,17 +51,28 @@ def test_an_unknown_node_cuts_the_chain_and_an_impossible_state_takes_no_part():
         Chain(chain.unary[:, a:b], chain.pairwise[:, a : b - 1], chain.mask[:, a:b], chain.label[:, a:b], chain.known[:, a:b])
         for a, b in ((0, 2), (3, 5))
     ]
-    constant = -torch.log(torch.tensor(3.0, dtype=torch.float64))
-    assert_close(cut, sum(part.log_likelihood(WEIGHTS) for part in parts) + constant)
+    assert_close(cut, sum(part.log_likelihood(WEIGHTS) for part in parts))
 
 
 def test_stacked_batches_are_the_sum_of_their_parts():
     parts = [make_chain(2, 4, 3, 2), make_chain(1, 6, 5, 3)]
     together = stack(parts)
-    masked = replace(together, mask=together.mask)
     expected = torch.cat([part.log_likelihood(WEIGHTS) for part in parts])
-    spare = (~together.known).sum(-1) * torch.log(torch.tensor(5.0, dtype=torch.float64))
-    assert_close(masked.log_likelihood(WEIGHTS) + spare, expected)
+    assert_close(together.log_likelihood(WEIGHTS), expected)
+
+
+def test_a_batch_is_its_pairs():
+    pairs = [simulate_pairs(SimulatorConfig(beams=beams), 1, 1, 5)[0] for beams in (31, 61, 23)]
+
+    def values(some):
+        batch = ScanPairBatch.collate(some, torch.float64)
+        batch.truth.known[:, 3] = False
+        plugins, scales, boosters = true_plugins(batch, 4), Scales().double(), Boosters(1).double()
+        association = association_chain(PairView.of(batch), plugins, scales, boosters, InferenceConfig(candidates=4))
+        clustering = clustering_chain(PairView.of(batch), plugins, scales)
+        return torch.stack([association.log_likelihood(normal(23)), clustering.log_likelihood(normal(20))])
+
+    assert_close(values(pairs), torch.cat([values([pair]) for pair in pairs], dim=-1))
 
 
 @pytest.mark.parametrize("objective", ["pseudo_likelihood", "likelihood"])

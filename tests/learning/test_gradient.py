@@ -17,8 +17,9 @@ import torch
 from small_run import Watcher
 from torch import Tensor
 
+from torchcrf_scan.config import EncoderConfig
 from torchcrf_scan.learning.checkpoint import NAME
-from torchcrf_scan.learning.gradient import Learner, has_amp
+from torchcrf_scan.learning.gradient import Learner, has_amp, portions_from
 from torchcrf_scan.learning.objectives import pseudo_likelihood
 from torchcrf_scan.learning.portions import Portion, as_portion
 from torchcrf_scan.learning.ranks import ALONE, Ranks
@@ -56,6 +57,14 @@ def assert_identical(a: Any, b: Any, where: str = "") -> None:
 def final(learner: Learner) -> dict[str, Any]:
     """All that a run ends with: the state that goes on and the weights that are kept."""
     return {"last": learner.state_dict(), "model": dict(learner.model.state_dict())}
+
+
+@pytest.mark.parametrize(("width", "surveyed"), [(0, 0), (4, 2)])
+def test_the_workers_search_for_the_start_of_an_encoder(width: int, surveyed: int) -> None:
+    config = small_run.small_config(objective="pseudo_likelihood")
+    config = replace(config, model=replace(config.model, encoder=EncoderConfig(width=width)))
+    portion = next(portions_from(0, config, small_run.small_pairs()[0], ALONE))
+    assert len(portion.surveys) == surveyed
 
 
 @pytest.fixture(scope="module")

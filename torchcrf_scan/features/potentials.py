@@ -142,6 +142,15 @@ class AssociationStates:
             margin = margin + view.learned.embeddings.data_score(candidates)
         return cls(candidates, mask, static, margin)
 
+    def with_targets(self, targets: AssociationStates, put: Tensor) -> AssociationStates:
+        """The states with the only one of `targets` in place of those where put (B, N, K) is True."""
+        return AssociationStates(
+            torch.where(put, targets.candidates, self.candidates),
+            self.mask | put,
+            torch.where(put[..., None], targets.static, self.static),
+            torch.where(put, targets.static_margin, self.static_margin),
+        )
+
     def nodes(self, part: slice) -> AssociationStates:
         """The states of a slice of source points."""
         return AssociationStates(self.candidates[:, part], self.mask[:, part], self.static[:, part], self.static_margin[:, part])
@@ -154,27 +163,60 @@ def registered_points(source_points: Tensor, motions: Tensor, active: Tensor, lo
     return se2.apply(motion, source_points[:, :, None])[:, :, 0]
 
 
-def association_unary(view: PairView, states: AssociationStates, moved: Tensor, scales: Scales, boosters: Boosters) -> Tensor:
+def association_unary(
+    view: PairView,
+    states: AssociationStates,
+    moved: Tensor,
+    scales: Scales,
+    boosters: Boosters,
+    found: AssociationStates | None = None,
+) -> Tensor:
     """Features of every state, the outlier last: 12 channels, data and outlier boosting (spec 2.4, 5.1), the extensions.
 
-    moved: (B, N, 2) source points under their own motion. Returns (B, N, K+1, 19).
+    Args:
+        moved: (B, N, 2) source points under their own motion.
+        found: the states that inference would find, for the inputs of the outlier booster; None: `states`.
+
+    Returns:
+        (B, N, K+1, 19).
     """
-    distance = association.registered_distance(moved, view.batch.target, states.candidates)
+    target = view.batch.target
+    distance = association.registered_distance(moved, target, states.candidates)
     registered = robust_square(distance, scales.local[STATIC_CHANNELS])
+    margin = None
+    if found is not None:
+        margin = outlier_margin(found, association.registered_feature(moved, target, found.candidates, scales), boosters)
     extension = association_extension(distance, states.mask, look(view.target_sweep, moved), scales)
-    return torch.cat([unary_at(states, registered, scales, boosters), extension], dim=-1)
+    return torch.cat([unary_at(states, registered, scales, boosters, margin), extension], dim=-1)
 
 
-def unary_at(states: AssociationStates, registered: Tensor, scales: Scales, boosters: Boosters) -> Tensor:
-    """The paper's 14 features of `association_unary` from the registered channel (B, N, K) of the candidates."""
+def local_channels(states: AssociationStates, registered: Tensor, boosters: Boosters) -> tuple[Tensor, Tensor]:
+    """(B, N, K, 12) channels and (B, N, K) data booster's margin of the candidates. registered: (B, N, K)."""
     registered = registered[..., None]
-    local = torch.cat([states.static, registered], dim=-1)  # (B, N, K, 12)
     margin = states.static_margin + boosters.data.margins(registered, first=STATIC_CHANNELS)
-    outlier_margin = boosters.outlier(association.outlier_inputs(local, margin, states.candidates, states.mask))  # (B, N)
+    return torch.cat([states.static, registered], dim=-1), margin
+
+
+def outlier_margin(states: AssociationStates, registered: Tensor, boosters: Boosters) -> Tensor:
+    """(B, N) the outlier booster's margin over the candidates. registered: (B, N, K)."""
+    local, margin = local_channels(states, registered, boosters)
+    return boosters.outlier(association.outlier_inputs(local, margin, states.candidates, states.mask))
+
+
+def unary_at(
+    states: AssociationStates, registered: Tensor, scales: Scales, boosters: Boosters, of_outlier: Tensor | None = None
+) -> Tensor:
+    """The paper's 14 features of `association_unary` from the registered channel (B, N, K) of the candidates.
+
+    of_outlier: (B, N) the outlier booster's margin; None: over these candidates.
+    """
+    local, margin = local_channels(states, registered, boosters)
+    if of_outlier is None:
+        of_outlier = boosters.outlier(association.outlier_inputs(local, margin, states.candidates, states.mask))
     inliers = torch.cat([local, margin[..., None], torch.zeros_like(margin)[..., None]], dim=-1)
-    B, N = outlier_margin.shape
+    B, N = of_outlier.shape
     outlier = torch.cat(
-        [scales.local_outlier.expand(B, N, -1), torch.zeros_like(outlier_margin)[..., None], outlier_margin[..., None]], dim=-1
+        [scales.local_outlier.expand(B, N, -1), torch.zeros_like(of_outlier)[..., None], of_outlier[..., None]], dim=-1
     )
     return torch.cat([inliers, outlier[:, :, None]], dim=2)
 

@@ -7,6 +7,7 @@ optimises on them. `Chain` keeps the transitions too, for the exact likelihood (
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -106,16 +107,20 @@ class Chain:
         return Design(features, self.mask, self.label, self.known, self.extra)
 
     def log_likelihood(self, weights: Tensor) -> Tensor:
-        """(B,) exact log p(true labels | observation) by the forward recursion (spec 6.5). weights: (U + P,)."""
+        """(B,) exact log p(true labels | observation) by the forward recursion (spec 6.5); 0 for unannotated nodes.
+
+        weights: (U + P,).
+        """
         split = self.unary.shape[-1]
         log_unary = add_log(self.unary @ weights[:split], self.extra).masked_fill(~self.mask, -torch.inf)
         log_unary = torch.where(self.known[..., None], log_unary, torch.zeros_like(log_unary))
+        free = (~self.known).sum(-1).to(log_unary) * math.log(self.mask.shape[2])  # an unknown node adds log S to log Z
         both = self.known[:, 1:] & self.known[:, :-1]
         log_pairwise = (self.pairwise @ weights[split:]) * both[..., None, None]
         of_nodes = log_unary.gather(-1, self.label[..., None])[..., 0]
         rows = log_pairwise.gather(2, self.label[:, :-1, None, None].expand(-1, -1, 1, log_pairwise.shape[3]))[:, :, 0]
         of_edges = rows.gather(-1, self.label[:, 1:, None])[..., 0]
-        return of_nodes.sum(-1) + of_edges.sum(-1) - log_partition(log_unary, log_pairwise)
+        return of_nodes.sum(-1) + of_edges.sum(-1) + free - log_partition(log_unary, log_pairwise)
 
 
 def true_plugins(batch: ScanPairBatch, clusters: int) -> PlugIns:
@@ -143,17 +148,31 @@ def _truth_of(batch: ScanPairBatch) -> Truth:
 def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> Chain:
     """The association chain's 19 + 4 features; states are the candidates of inference and the true target point."""
     batch = view.batch
-    truth = _truth_of(batch)
     found = find_candidates(view, plugins.motions, plugins.active, config)
-    index, mask, label = candidate_search.with_targets(found.index, found.mask, truth.association)
-    states = AssociationStates.of(view, index, mask, scales, boosters)
+    as_found, states, label = states_with_truth(view, found, scales, boosters)
     C = plugins.motions.shape[1]
     one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), C + 1).to(batch.source.dtype)
     moved = registered_points(batch.source, plugins.motions, plugins.active, one_hot)
-    unary = association_unary(view, states, moved, scales, boosters)
-    pairwise = pairwise_features(batch.source, batch.target, index, scales)
-    known = truth.known & batch.source_mask
-    return Chain(unary, pairwise, state_mask(mask), label, known, association_extra(view.learned, index))
+    unary = association_unary(view, states, moved, scales, boosters, as_found)
+    pairwise = pairwise_features(batch.source, batch.target, states.candidates, scales)
+    extra = association_extra(view.learned, states.candidates)
+    return Chain(unary, pairwise, state_mask(states.mask), label, plugins.known & batch.source_mask, extra)
+
+
+def states_with_truth(
+    view: PairView, found: candidate_search.Candidates, scales: Scales, boosters: Boosters
+) -> tuple[AssociationStates, AssociationStates, Tensor]:
+    """The states of the candidates that inference would find, the same with the true targets, and (B, N) the true states.
+
+    The outlier booster takes the first, in training as in use: its inputs must not tell which target is the true one.
+    """
+    association = _truth_of(view.batch).association
+    index, mask, label = candidate_search.with_targets(found.index, found.mask, association)
+    put = mask & ~(found.mask & (found.index == index))
+    as_found = AssociationStates.of(view, found.index, found.mask, scales, boosters)
+    target = association.clamp(min=0)[..., None]
+    true = AssociationStates.of(view, target, torch.ones_like(target, dtype=torch.bool), scales, boosters)
+    return as_found, as_found.with_targets(true, put), label
 
 
 def association_design(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> Design:
@@ -215,13 +234,15 @@ def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Paramete
     return total
 
 
-def for_background_alone(plugins: PlugIns) -> PlugIns:
-    """The plug-ins of CRF-Matching: every point moves with the background."""
+def for_background_alone(plugins: PlugIns, batch: ScanPairBatch) -> PlugIns:
+    """The plug-ins of CRF-Matching: every annotated point moves with the background, that of a mover without a slot too."""
+    truth = _truth_of(batch)
     return replace(
         plugins,
         motions=plugins.motions[:, :1],
         active=plugins.active[:, :1],
         cluster=torch.zeros_like(plugins.cluster),
-        label=plugins.label.clamp(max=0),
+        label=truth.cluster.clamp(max=0).masked_fill(~truth.known, -1),
+        known=truth.known,
         reach=None,
     )

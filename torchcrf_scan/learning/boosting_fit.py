@@ -67,7 +67,7 @@ def stump_of(tree: object) -> tuple[int, float, float, float]:
 def data_examples(
     view: PairView, plugins: PlugIns, scales: Scales, negatives: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Pairs of points: the true one of every inlier, and wrong ones: half uniform, a third near in space, the rest near in index.
+    """Pairs of points: the true one of every inlier, and wrong ones as in `sample_targets` (spec 2.2).
 
     Returns:
         (P, 12) local channels and (P,) bool.
@@ -91,7 +91,11 @@ def data_examples(
 def sample_targets(
     truth: Tensor, moved: Tensor, target: Tensor, target_mask: Tensor, count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Wrong targets (B, N, count) and their mask: never the true one or, as annotators err by one, its neighbour."""
+    """Wrong targets of every point and their mask, (B, N, count): half of them uniform, the others near (spec 2.2).
+
+    For an inlier a third is near in space and the rest near in index, never the true one or, as annotators err by one, its
+    neighbour. For an outlier they are the nearest in space.
+    """
     B, N = truth.shape
     M = target.shape[1]
     near_index = max(1, count // 5) if count > 1 else 0
@@ -103,14 +107,18 @@ def sample_targets(
 
     length = target_mask.sum(-1)[:, None, None]
     anywhere = draw(M, uniform) % length.clamp(min=1)
-    nearest = squared_distances(moved, target, target_mask).topk(min(NEAREST, M), largest=False).indices  # (B, N, 15)
-    close = nearest.gather(-1, draw(nearest.shape[-1], near_space))
+    near = near_space + near_index
+    most = min(max(NEAREST, near), M)
+    nearest = squared_distances(moved, target, target_mask).topk(most, largest=False).indices  # (B, N, 15) or more
+    close = nearest.gather(-1, draw(min(NEAREST, M), near_space))
     step = (2 + draw(9, near_index)) * (1 - 2 * draw(2, near_index))
     beside = truth.clamp(min=0)[..., None] + step
-    index = torch.cat([anywhere, close, beside], dim=-1)
+    of_inlier, of_outlier = torch.cat([close, beside], dim=-1), torch.nn.functional.pad(nearest, (0, near - most), value=M)
+    is_outlier = (truth < 0)[..., None]
+    index = torch.cat([anywhere, torch.where(is_outlier, of_outlier, of_inlier)], dim=-1)
     inside = (index >= 0) & (index < length)
     wrong = (index - truth[..., None]).abs() > 1
-    return index.clamp(0, M - 1), inside & (wrong | (truth < 0)[..., None])
+    return index.clamp(0, M - 1), inside & (wrong | is_outlier)
 
 
 def outlier_examples(

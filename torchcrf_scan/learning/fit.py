@@ -122,7 +122,7 @@ def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generat
     start = view.in_unit(part.start)
     plugins = training_plugins(view.batch, start, config, generator)
     if not model.config.has_clusters:
-        plugins, start = pseudo_likelihood.for_background_alone(plugins), start.background_alone()
+        plugins, start = pseudo_likelihood.for_background_alone(plugins, view.batch), start.background_alone()
     return Lesson(view, start, plugins, part.fold)
 
 

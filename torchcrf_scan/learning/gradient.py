@@ -169,7 +169,8 @@ def portions_from(step: int, config: Config, pairs: Sequence[ScanPair], ranks: R
     """This process's portions of all steps after `step`."""
     gradient = config.gradient
     parts = Parts(gradient.batch_size, gradient.part, step, gradient.steps, ranks.rank, ranks.world)
-    collate = Collate(config.learning.disturbance, gradient.seed, LOSSES[config.first_order].needs_start)
+    needs_start = LOSSES[config.first_order].needs_start or config.model.encoder.width > 0  # motions that align the scans for it
+    collate = Collate(config.learning.disturbance, gradient.seed, needs_start)
     return load_portions(PairStream(gradient, pairs), parts, collate, gradient.workers)
 
 

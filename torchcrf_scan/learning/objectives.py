@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -34,21 +33,21 @@ def known_nodes(batch: ScanPairBatch) -> Tensor:
 
 def pseudo_likelihood(model: JointScanCRF, portion: Portion) -> dict[str, Tensor]:
     """Negative log pseudo-likelihood per annotated node."""
-    loss = -model.pseudo_log_likelihood(portion.batch).sum() / known_nodes(portion.batch).clamp(min=1)
+    start = None if model.encoder is None else start_of(model, portion)
+    loss = -model.pseudo_log_likelihood(portion.batch, start=start).sum() / known_nodes(portion.batch).clamp(min=1)
     return {"total": loss}
 
 
 def likelihood(model: JointScanCRF, portion: Portion, config: LearningConfig) -> dict[str, Tensor]:
     """Negative log of the exact likelihood of each chain per annotated node (spec 6.5), `association` and `cluster`, or `lattice`.
 
-    At the motions of the start where they are right and the portion was surveyed, else at the true ones. Costs a forward and a
-    backward recursion over the points; memory N K^2 transitions of every feature.
+    At the motions of the start where they are right, if the portion was surveyed or the model has an encoder; else at the true
+    ones. Costs a forward and a backward recursion over the points; memory N K^2 transitions of every feature.
     """
     nodes = known_nodes(portion.batch).clamp(min=1)
     terms: dict[str, Tensor] = {}
     for name, chain, weights in labelled_chains(model, portion, config):
-        uniform = (~chain.known).sum().to(weights) * -math.log(chain.mask[0, 0].numel())  # of the nodes that are cut off
-        terms[name] = -(chain.log_likelihood(weights).sum() - uniform) / nodes
+        terms[name] = -chain.log_likelihood(weights).sum() / nodes
     return terms | {"total": torch.stack([*terms.values()]).sum()}
 
 
@@ -61,7 +60,7 @@ def labelled_chains(
     """
     batch, fitted, inference = portion.batch, model.fitted, model.config.inference
     learned = fitted.scales, fitted.boosters, inference
-    start = start_of(model, portion) if portion.surveys else None
+    start = start_of(model, portion) if portion.surveys or model.encoder is not None else None
     generator = torch.Generator().manual_seed(portion.seed)
     view = model.view(batch, model.learned_inputs(batch, start))
     if start is None:
@@ -73,7 +72,7 @@ def labelled_chains(
         yield model.config.coupling, one_chain(view, plugins, *learned), torch.cat([fitted.association, fitted.clustering])
         return
     if not has_clusters:
-        plugins = features.for_background_alone(plugins)
+        plugins = features.for_background_alone(plugins, view.batch)
     if has_association:
         yield "association", features.association_chain(view, plugins, *learned), fitted.association
     if has_association and has_clusters and start is not None:

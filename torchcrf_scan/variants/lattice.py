@@ -17,13 +17,13 @@ from torch import Tensor
 
 from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features.candidates import Candidates
-from torchcrf_scan.features.learned import association_extra, clustering_extra
+from torchcrf_scan.features.learned import add_log
 from torchcrf_scan.features.potentials import AssociationStates, PairView, possible_clusters
 from torchcrf_scan.inference.joint import association_labels, cluster_labels, update_motions
 from torchcrf_scan.inference.messages import normalise, normalise_beliefs, reduce_states
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters, State
-from torchcrf_scan.variants.lattice_features import LatticePotentials, lattice_features, transition_kinds
+from torchcrf_scan.variants.lattice_features import LatticePotentials, lattice_extra, lattice_features, transition_kinds
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,11 +165,8 @@ def update_labels(
     possible = possible_clusters(motions.active, start.reach, batch.source.shape[1])
     features = lattice_features(view, states, motions.value, found.nearest, possible, parameters.scales, parameters.boosters)
     potentials = features.potentials(torch.cat([parameters.association, parameters.clustering]))
-    of_association, of_cluster = association_extra(view.learned, found.index), clustering_extra(view.learned, possible.shape[-1])
-    if of_association is not None:
-        potentials = replace(potentials, log_unary=potentials.log_unary + of_association[..., None])
-    if of_cluster is not None:
-        potentials = replace(potentials, log_unary=potentials.log_unary + of_cluster[:, :, None])
+    extra = lattice_extra(view.learned, found.index, possible.shape[-1])
+    potentials = replace(potentials, log_unary=add_log(potentials.log_unary, extra))
     beliefs = lattice_beliefs(potentials, batch.source_mask, config.temperature)
     place, cluster = beliefs.best()
     return replace(

@@ -18,7 +18,8 @@ from torch.nn.functional import pad
 from torchcrf_scan.features import association, clustering
 from torchcrf_scan.features.extension import association_extension, clustering_extension
 from torchcrf_scan.features.free_space import FreeSpace, look
-from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, state_mask, unary_at
+from torchcrf_scan.features.learned import LearnedInputs, add_log, association_extra, clustering_extra
+from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, outlier_margin, state_mask, unary_at
 from torchcrf_scan.features.scales import Scales, robust_square
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
@@ -124,6 +125,7 @@ def lattice_features(
     possible: Tensor,
     scales: Scales,
     boosters: Boosters,
+    found: AssociationStates | None = None,
 ) -> LatticeFeatures:
     """Features of every super-node, its point moved by its own cluster's motion.
 
@@ -134,20 +136,21 @@ def lattice_features(
     Args:
         states: candidates (B, N, K) with their static features. motions: (B, C, 3).
         nearest: (B, N, C) nearest target point under every motion. possible: (B, N, D) clusters that are not ruled out.
+        found: the states that inference would find, for the inputs of the outlier booster; None: `states`.
     """
     batch = view.batch
     nobody = torch.full_like(nearest[..., 0], -1)
     at = clustering.correspond(batch.source, batch.target, motions, nearest, nobody)
-    partner = gather_points(batch.target, states.candidates)  # (B, N, K, 2)
-    distance = torch.linalg.vector_norm(at.moved[:, :, None] - partner[..., None, :], dim=-1)  # (B, N, K, C)
-    registered = robust_square(distance, scales.local[STATIC_CHANNELS])
-    best = registered.masked_fill(~possible[:, :, None, :-1], -torch.inf).amax(-1)  # (B, N, K)
-    static = unary_at(states, best, scales, boosters)[..., list(STATIC_WEIGHTS)]
+    partner, distance, registered, best = registered_under_all(at.moved, batch.target, states.candidates, possible, scales)
+    margin = None
+    if found is not None:
+        of_found = registered_under_all(at.moved, batch.target, found.candidates, possible, scales)
+        margin = outlier_margin(found, of_found[-1], boosters)
     registered = torch.cat([registered, best[..., None]], dim=-1)  # (B, N, K, D)
     of_association, of_cluster = extension_channels(view, states, at, distance, motions, possible, scales)
     residual = at.residual.masked_fill(~possible[..., :-1], torch.inf).amin(-1)
     return LatticeFeatures(
-        static=static,
+        static=unary_at(states, best, scales, boosters, margin)[..., list(STATIC_WEIGHTS)],
         moving=torch.cat(
             [
                 registered_channels(registered, states.static_margin, scales, boosters),
@@ -162,6 +165,27 @@ def lattice_features(
         pairwise_cluster=clustering.pairwise_features(batch.source, at, scales),
         mask=state_mask(states.mask)[..., None] & possible[:, :, None],
     )
+
+
+def registered_under_all(
+    moved: Tensor, target: Tensor, candidates: Tensor, possible: Tensor, scales: Scales
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Candidates under every motion: points (B, N, K, 2), distances and L12 (B, N, K, C), the best L12 of a possible one (B, N, K).
+
+    moved: (B, N, C, 2) source points.
+    """
+    partner = gather_points(target, candidates)
+    distance = torch.linalg.vector_norm(moved[:, :, None] - partner[..., None, :], dim=-1)
+    registered = robust_square(distance, scales.local[STATIC_CHANNELS])
+    return partner, distance, registered, registered.masked_fill(~possible[:, :, None, :-1], -torch.inf).amax(-1)
+
+
+def lattice_extra(learned: LearnedInputs | None, candidates: Tensor, clusters: int) -> Tensor | None:
+    """Learned log potentials that broadcast to (B, N, A, D); None without learned inputs. candidates: (B, N, K); clusters: D."""
+    of_association, of_cluster = association_extra(learned, candidates), clustering_extra(learned, clusters)
+    by_association = None if of_association is None else of_association[..., None]
+    by_cluster = None if of_cluster is None else of_cluster[:, :, None]
+    return by_cluster if by_association is None else add_log(by_association, by_cluster)
 
 
 def registered_channels(registered: Tensor, static_margin: Tensor, scales: Scales, boosters: Boosters) -> Tensor:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchcrf_scan.config import InferenceConfig, ModelConfig
-from torchcrf_scan.features.candidates import with_targets
-from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, find_candidates, possible_clusters
+from torchcrf_scan.features.learned import add_log
+from torchcrf_scan.features.potentials import Boosters, PairView, find_candidates, possible_clusters
 from torchcrf_scan.features.scales import Scales
-from torchcrf_scan.inference.pseudo_likelihood import Design, PlugIns, at_true_neighbours, beside_true_neighbours
+from torchcrf_scan.inference.pseudo_likelihood import Design, PlugIns, at_true_neighbours, beside_true_neighbours, states_with_truth
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.variants.lattice import lattice_log_partition
@@ -25,6 +26,7 @@ from torchcrf_scan.variants.lattice_features import (
     STATIC_WEIGHTS,
     LatticeFeatures,
     LatticePotentials,
+    lattice_extra,
     lattice_features,
     transition_kinds,
 )
@@ -39,6 +41,7 @@ class LatticeChain(LatticeFeatures):
     Attributes:
         association, cluster: (B, N) true states, the outliers last.
         known: (B, N) nodes both of whose labels are annotated; the others cut the chain.
+        extra: learned log potentials that broadcast to (B, N, A, D); None: none.
         axes, labels: as in `pseudo_likelihood.Chain`; a association states, d clusters.
     """
 
@@ -52,6 +55,7 @@ class LatticeChain(LatticeFeatures):
     association: Tensor
     cluster: Tensor
     known: Tensor
+    extra: Tensor | None = None
 
     def design(self) -> Design:
         """The 43 features of every super-node at its true neighbours; the index of state (j, k) is j D + k."""
@@ -64,7 +68,8 @@ class LatticeChain(LatticeFeatures):
         of_cluster = at_true_neighbours(self.pairwise_cluster, self.cluster, self.known)
         features[..., CLUSTER_PAIRWISE] = of_cluster[:, :, None]
         features[..., ELASTIC_WEIGHTS] = self._elastic_at_true_neighbours()
-        return Design(features.flatten(2, 3), self.mask.flatten(2), self.association * D + self.cluster, self.known)
+        extra = None if self.extra is None else self.extra.expand(self.mask.shape).flatten(2)
+        return Design(features.flatten(2, 3), self.mask.flatten(2), self.association * D + self.cluster, self.known, extra)
 
     def _elastic_at_true_neighbours(self) -> Tensor:
         """(B, N, A, D, 3): the only features of both labels of a node and of its neighbour."""
@@ -76,9 +81,12 @@ class LatticeChain(LatticeFeatures):
         return sum(a[:, :, :, None] * c[:, :, None] for a, c in zip(of_association, of_cluster, strict=True))  # type: ignore[return-value]
 
     def log_likelihood(self, weights: Tensor) -> Tensor:
-        """(B,) exact log p(both true labellings | observation). weights: (43,)."""
-        potentials = self.potentials(weights).cut(self.known)
-        return self._score(potentials) - lattice_log_partition(potentials)
+        """(B,) exact log p(both true labellings | observation); 0 for unannotated nodes. weights: (43,)."""
+        potentials = self.potentials(weights)
+        potentials = replace(potentials, log_unary=add_log(potentials.log_unary, self.extra)).cut(self.known)
+        states = self.mask.shape[2] * self.mask.shape[3]
+        free = (~self.known).sum(-1).to(potentials.log_unary) * math.log(states)  # an unknown node adds log A D to log Z
+        return self._score(potentials) + free - lattice_log_partition(potentials)
 
     def _score(self, potentials: LatticePotentials) -> Tensor:
         """(B,) score of the true labels."""
@@ -98,18 +106,17 @@ def lattice_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Bo
 
     States are the candidates of inference and the true target point, times the clusters.
     """
-    batch, truth = view.batch, view.batch.truth
-    assert truth is not None
+    batch = view.batch
     found = find_candidates(view, plugins.motions, plugins.active, config)
-    index, mask, association = with_targets(found.index, found.mask, truth.association)
-    states = AssociationStates.of(view, index, mask, scales, boosters)
-    possible = possible_clusters(plugins.active, plugins.reach, index.shape[1])
-    features = lattice_features(view, states, plugins.motions, found.nearest, possible, scales, boosters)
+    as_found, states, association = states_with_truth(view, found, scales, boosters)
+    possible = possible_clusters(plugins.active, plugins.reach, batch.source.shape[1])
+    features = lattice_features(view, states, plugins.motions, found.nearest, possible, scales, boosters, as_found)
     return LatticeChain(
         **{f.name: getattr(features, f.name) for f in fields(LatticeFeatures)},
         association=association,
         cluster=torch.where(plugins.label >= 0, plugins.label, plugins.motions.shape[1]),
-        known=truth.known & plugins.known & batch.source_mask,
+        known=plugins.known & batch.source_mask,
+        extra=lattice_extra(view.learned, states.candidates, possible.shape[-1]),
     )
 
 
