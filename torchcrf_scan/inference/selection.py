@@ -55,7 +55,7 @@ class ConsideredChain:
 
     Attributes:
         view, start, parameters: as in `joint.decode`.
-        at: moved points and their residuals. beside_local: (B, N, D, 8) features that do not depend on the set of clusters.
+        at: moved points and their residuals. beside_local: (B, N, D, 9) features that do not depend on the set of clusters.
         pairwise: (B, N-1, D, D, 8).
     """
 
@@ -73,7 +73,7 @@ class ConsideredChain:
         found = find_candidates(view, motions.value, motions.active, config)
         at = clustering.correspond(batch.source, batch.target, motions.value, found.nearest, state.association)
         pairwise = clustering.pairwise_features(batch.source, at, scales)
-        return cls(view, start, parameters, at, contradictions(view, at, motions.value, scales), pairwise)
+        return cls(view, start, parameters, at, contradictions(view, at, motions.value, scales, start.reach), pairwise)
 
     def evidence(self, active: Tensor) -> Tensor:
         """(B, C) log Z of the chain with all active clusters minus log Z without the cluster; 0 for inactive ones.
@@ -88,7 +88,8 @@ class ConsideredChain:
         is_other = ~torch.eye(C, dtype=torch.bool, device=active.device)
         is_other = torch.cat([torch.ones_like(is_other[:1]), is_other[1:]])  # row 0: all clusters; row k: without cluster k
         there = active & is_other[:, None]  # (C, B, C)
-        possible = torch.stack([possible_clusters(row, self.start.reach, mask.shape[1]) for row in there])  # (C, B, N, D)
+        within = self.view.within(self.start.reach)
+        possible = torch.stack([possible_clusters(row, within, mask.shape[1]) for row in there])  # (C, B, N, D)
         extra = clustering_extra(self.view.learned, C + 1)
         every = torch.ones_like(possible[0])
         log_unary, log_pairwise = clustering_potentials(local, self.pairwise, every, self.parameters.clustering, extra)

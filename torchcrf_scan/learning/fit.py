@@ -120,7 +120,7 @@ def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generat
     """The training plug-ins of one batch; for CRF-Matching every point moves with the background."""
     view = model.view(part.batch)
     start = view.in_unit(part.start)
-    plugins = training_plugins(view.batch, start, config, generator)
+    plugins = training_plugins(view.batch, start, config, generator, found_reach=view.reach == "soft")
     if not model.config.has_clusters:
         plugins, start = pseudo_likelihood.for_background_alone(plugins), start.background_alone()
     return Lesson(view, start, plugins, part.fold)
@@ -175,7 +175,7 @@ def clustering_chain(
 
 @torch.no_grad()
 def set_weights(model: JointScanCRF, chain: str, values: Tensor) -> None:
-    """Writes (23,) or (20,) weights into the named parameters; those of left-out features are skipped."""
+    """Writes (23,) or (21,) weights into the named parameters; those of left-out features are skipped."""
     names, weights = {
         "association": (ASSOCIATION_WEIGHTS, model.association_weights),
         "clustering": (CLUSTERING_WEIGHTS, model.clustering_weights),

@@ -11,14 +11,19 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.features.potentials import resolution
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.pseudo_likelihood import PlugIns, true_plugins
-from torchcrf_scan.inference.start import Start, within_reach
+from torchcrf_scan.inference.start import Start, beyond_reach
 from torchcrf_scan.learning.settings import LearningConfig
 
 
-def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig, generator: torch.Generator) -> PlugIns:
+def training_plugins(
+    batch: ScanPairBatch, start: Start, config: LearningConfig, generator: torch.Generator, *, found_reach: bool = False
+) -> PlugIns:
     """True motions with noise for some pairs, InitialiseRT's for the others; spare slots hold its spurious movers (spec 2.5, 6.2).
 
     A found motion replaces a true one if it moves that cluster's points nearly alike. Labels are the annotated ones.
+
+    found_reach: reaches of the found segments, as in use, for the movers that are found; else of all true points of each, within
+        which every true label is possible.
     """
     truth = true_plugins(batch, start.motions.shape[1])
     noise = torch.randn(truth.motions.shape, generator=generator, dtype=torch.float64).to(truth.motions)
@@ -29,7 +34,8 @@ def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig,
     found = torch.einsum("bgk,bkc->bgc", stands_for.to(noisy), start.motions)
     take = stands_for.any(-1) & use_start.to(noisy.device)[:, None]
     motions = torch.where(take[..., None], found, noisy)
-    return fill_spare_slots(replace(truth, motions=motions), batch, start, stands_for)
+    plugins = fill_spare_slots(replace(truth, motions=motions), batch, start, stands_for)
+    return replace(plugins, reach=as_found(plugins.reach, start.reach, stands_for)) if found_reach else plugins
 
 
 def match_start(batch: ScanPairBatch, start: Start, truth: PlugIns) -> Tensor:
@@ -64,10 +70,18 @@ def fill_spare_slots(plugins: PlugIns, batch: ScanPairBatch, start: Start, stand
     return replace(plugins, motions=motions, active=active, reach=None if start.reach is None else reach)
 
 
+def as_found(reach: Tensor | None, found: Tensor | None, stands_for: Tensor) -> Tensor | None:
+    """(B, N, C) reaches of the found segments (B, N, C) where one stands for the cluster, else those given; None: none are."""
+    if reach is None or found is None:
+        return None
+    matched = torch.einsum("bgk,bnk->bng", stands_for.to(found), found)
+    return torch.where(stands_for.any(-1)[:, None], matched, reach)
+
+
 def reach_of_truth(plugins: PlugIns, batch: ScanPairBatch) -> Tensor:
-    """(B, N, C) points within reach of the true points of every cluster."""
+    """(B, N, C) `beyond_reach` of the true points of every cluster."""
     clusters = torch.arange(plugins.motions.shape[1], device=plugins.label.device)
-    return within_reach(batch.source, plugins.label[:, None] == clusters[:, None], resolution(batch))
+    return beyond_reach(batch.source, plugins.label[:, None] == clusters[:, None], resolution(batch))
 
 
 def mix_associations(plugins: PlugIns, predicted: Tensor, share: float, generator: torch.Generator) -> PlugIns:

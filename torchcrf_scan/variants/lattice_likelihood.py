@@ -54,7 +54,7 @@ class LatticeChain(LatticeFeatures):
     known: Tensor
 
     def design(self) -> Design:
-        """The 43 features of every super-node at its true neighbours; the index of state (j, k) is j D + k."""
+        """The 44 features of every super-node at its true neighbours; the index of state (j, k) is j D + k."""
         D = self.mask.shape[3]
         features = self.moving.new_zeros(*self.mask.shape, WEIGHTS)
         features[..., list(STATIC_WEIGHTS)] = self.static[:, :, :, None]
@@ -76,7 +76,7 @@ class LatticeChain(LatticeFeatures):
         return sum(a[:, :, :, None] * c[:, :, None] for a, c in zip(of_association, of_cluster, strict=True))  # type: ignore[return-value]
 
     def log_likelihood(self, weights: Tensor) -> Tensor:
-        """(B,) exact log p(both true labellings | observation). weights: (43,)."""
+        """(B,) exact log p(both true labellings | observation). weights: (44,)."""
         potentials = self.potentials(weights).cut(self.known)
         return self._score(potentials) - lattice_log_partition(potentials)
 
@@ -103,8 +103,8 @@ def lattice_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Bo
     found = find_candidates(view, plugins.motions, plugins.active, config)
     index, mask, association = with_targets(found.index, found.mask, truth.association)
     states = AssociationStates.of(view, index, mask, scales, boosters)
-    possible = possible_clusters(plugins.active, plugins.reach, index.shape[1])
-    features = lattice_features(view, states, plugins.motions, found.nearest, possible, scales, boosters)
+    possible = possible_clusters(plugins.active, view.within(plugins.reach), index.shape[1])
+    features = lattice_features(view, states, plugins.motions, found.nearest, possible, scales, boosters, plugins.reach)
     return LatticeChain(
         **{f.name: getattr(features, f.name) for f in fields(LatticeFeatures)},
         association=association,
