@@ -122,11 +122,11 @@ def test_the_literal_reading_learns_no_raw_weight(material: list[Material]) -> N
 
 
 def test_set_weights_follows_the_names() -> None:
-    model = JointScanCRF()
+    model = JointScanCRF(ModelConfig(features=FeatureConfig(reach="soft")))
     set_weights(model, "association", torch.arange(23.0))
-    set_weights(model, "clustering", torch.arange(20.0))
+    set_weights(model, "clustering", torch.arange(21.0))
     assert [model.association_weights[name].item() for name in ASSOCIATION_WEIGHTS] == list(range(23))
-    assert [model.clustering_weights[name].item() for name in CLUSTERING_WEIGHTS] == list(range(20))
+    assert [model.clustering_weights[name].item() for name in CLUSTERING_WEIGHTS] == list(range(21))
     with pytest.raises(ValueError, match="zip"):
         set_weights(model, "clustering", torch.arange(23.0))
 
@@ -134,7 +134,7 @@ def test_set_weights_follows_the_names() -> None:
 def test_set_weights_passes_over_what_the_model_does_not_have() -> None:
     model = JointScanCRF(ModelConfig(features=FeatureConfig(free_space=False, decisions=False, left_out=())))
     set_weights(model, "association", torch.arange(23.0))
-    set_weights(model, "clustering", torch.arange(20.0))
+    set_weights(model, "clustering", torch.arange(21.0))
     assert [weight.item() for weight in model.parameters()] == [*PAPER_ASSOCIATION, *PAPER_CLUSTERING]
 
 
