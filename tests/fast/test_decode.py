@@ -150,7 +150,7 @@ def test_reaches_are_decoded_alike(reach: str, weight: float, seed: int) -> None
         assert model.clustering_weights["reach"] == 0
         model.clustering_weights["reach"].fill_(weight)
     start = model.initialise(batch)
-    assert 0.1 < ((start.reach > 0) & (start.reach < FARTHEST)).any(1).float().mean()  # something in between
+    assert ((start.reach > 0) & (start.reach < FARTHEST)).any()  # something in between
     expected = model(batch, start)
     assert_same_answer(compiled(model, batch, start), expected)
     if weight == 0:

@@ -151,7 +151,12 @@ def make_batch(seed: int = 0, n: int = 50, m: int = 40) -> ScanPairBatch:
 
 
 def features(
-    batch: ScanPairBatch, motions: Tensor, cluster: Tensor, association: Tensor, candidates: int = 0
+    batch: ScanPairBatch,
+    motions: Tensor,
+    cluster: Tensor,
+    association: Tensor,
+    candidates: int = 0,
+    reach: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Both chains' extensions (1, N, K+1, 5) and (1, N, D, 9) at motions (C, 3) and labels (N,), -1 moved with the background."""
     view, scales, motions, cluster = PairView.of(batch, reach="soft"), make_scales(), motions[None], cluster[None]
@@ -162,15 +167,15 @@ def features(
     moved = se2.apply(own, batch.source[:, :, None])[:, :, 0]
     of_association = association_unary(view, states, moved, scales, Boosters(1).double())
     at = clustering.correspond(batch.source, batch.target, motions, found.nearest, association[None])
-    of_cluster = clustering_unary(view, at, motions, active, scales, reach_of(batch, motions))
+    of_cluster = clustering_unary(view, at, motions, active, scales, reach_of(batch) if reach is None else reach)
     assert of_association.shape[-1] == ASSOCIATION_UNARY
     assert of_cluster.shape[-1] == CLUSTERING_UNARY
     return of_association[..., OF_ASSOCIATION], of_cluster[..., OF_CLUSTER]
 
 
-def reach_of(batch: ScanPairBatch, motions: Tensor) -> Tensor:
-    """(1, N, C) from 0 to 3, of a point and a motion and of nothing else. motions: (1, C, 3)."""
-    return (1 + 2 * torch.sin(batch.source.norm(dim=-1)[..., None] + 5 * motions[..., :1].detach().mT)).clamp(min=0)
+def reach_of(batch: ScanPairBatch) -> Tensor:
+    """(1, N, C) from 0 to 3."""
+    return (1 + 2 * torch.sin(batch.source.norm(dim=-1)[..., None] + torch.arange(len(MOTIONS)))).clamp(min=0)
 
 
 def labels(batch: ScanPairBatch, clusters: int = 3, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -183,7 +188,7 @@ def labels(batch: ScanPairBatch, clusters: int = 3, seed: int = 0) -> tuple[Tens
 def test_both_chains_look_where_they_should(seed: int) -> None:
     batch, scales = make_batch(seed), make_scales()
     cluster, association = labels(batch, seed=seed)
-    found, reach = features(batch, MOTIONS, cluster, association), reach_of(batch, MOTIONS[None])
+    found, reach = features(batch, MOTIONS, cluster, association), reach_of(batch)
     source, target, motions = batch.source[0].tolist(), batch.target[0].tolist(), MOTIONS.tolist()
     before, after = ((points, (0.0, 0.0), False, float(batch.range_noise)) for points in (source, target))
     for i, point in enumerate(source):
@@ -213,7 +218,7 @@ def test_the_order_of_the_movers_is_the_order_of_the_features() -> None:
     order = [0, 2, 1]
     one = features(batch, MOTIONS, cluster, association)
     renamed = torch.tensor([*order, -1])[cluster]  # the permutation is its own inverse
-    other = features(batch, MOTIONS[order], renamed, association)
+    other = features(batch, MOTIONS[order], renamed, association, reach=reach_of(batch)[..., order])
     assert_close(other[0], one[0])
     assert_close(other[1], one[1][:, :, [*order, 3]])
 

@@ -283,7 +283,7 @@ def test_the_potentials_of_a_toy_equal_the_loops_and_so_does_the_answer(seed: in
 
 @pytest.mark.parametrize("seed", range(4))
 def test_with_extensions_they_equal_the_loops_too_and_so_does_the_answer(seed: int) -> None:
-    N, M, C, mode = 4, 2 + seed % 2 * 3, 2, ("hard", "soft")[seed // 2]
+    N, M, C, mode = 4, 2 + seed % 2 * 3, 2, ("soft", "hard")[seed // 2]
     source, target = make_points(50, seed)[16 : 16 + N], make_points(50, seed + 20)[18 : 18 + M]  # dense: beams say something
     batch = make_batch(source[None], target[None])
     scales, boosters, weights = loose_scales(), Boosters(1).double(), normal(44, seed=seed)
@@ -340,7 +340,7 @@ def test_a_super_node_has_the_extensions_of_both_chains_given_the_others_state(c
         at = clustering.correspond(batch.source, batch.target, motions, found.nearest, association)
         expected = clustering_unary(view, at, motions, active, scales)[..., 4:]
         assert_close(moving[:, :, j, :, 11:][real[..., j]], expected[real[..., j]])
-    assert moving.shape[-1] == 19
+    assert moving.shape[-1] == 20
     assert (moving[real][..., 2:7] != 0).flatten(0, -2).any(0).all()
 
 
