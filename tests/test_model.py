@@ -24,7 +24,7 @@ from torchcrf_scan import (
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.start import Start, beyond_reach
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 
 ASSOCIATION = (
@@ -371,6 +371,8 @@ def test_gradients_reach_weights_and_points(what: str, metric: str) -> None:
     batch, start = tiny()
     source, target = batch.source.clone().requires_grad_(), batch.target.clone().requires_grad_()
     model = soft_model(metric)
+    halves = (torch.arange(10) >= 5) == torch.tensor([[False], [True]])
+    start = replace(start, reach=beyond_reach(source, halves[None], torch.tensor([0.05]).double()))
     found = getattr(model(replace(batch, source=source, target=target), start), what)
     value = total(found) if what != "motions" else (found * torch.tensor([3.0, 1.0, 2.0])).sum()
     value.backward()
@@ -405,6 +407,7 @@ def test_gradients_of_padded_simulated_pairs_are_finite(pairs: list[ScanPair]) -
 @pytest.mark.parametrize("metric", ["point", "line"])
 def test_gradcheck_of_the_unrolled_rounds_in_the_weights(metric: str) -> None:
     batch, start = tiny(6)
+    start = replace(start, reach=(4 * normal(1, 6, 2, seed=5)).clamp(0, 3))
     model = soft_model(metric)
     names = [name for name, _ in model.named_parameters()]
 
@@ -423,7 +426,9 @@ def test_gradcheck_of_the_unrolled_rounds_in_the_points(metric: str) -> None:
     model = soft_model(metric, free_space=False)  # no gradient passes through what the beams say
 
     def answers(source: Tensor, target: Tensor) -> tuple[Tensor, ...]:
-        found = model(replace(batch, source=source, target=target), start)
+        halves = (torch.arange(6) >= 3) == torch.tensor([[False], [True]])
+        begun = replace(start, reach=beyond_reach(source, halves[None], torch.tensor([0.05]).double()))
+        found = model(replace(batch, source=source, target=target), begun)
         return found.log_association.exp(), found.log_cluster.exp(), found.motions
 
     assert torch.autograd.gradcheck(answers, (batch.source.requires_grad_(), batch.target.requires_grad_()), atol=1e-6)

@@ -12,7 +12,7 @@ from support import assert_close, extended, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
-from torchcrf_scan.config import InferenceConfig, ModelConfig
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.candidates import with_targets
@@ -172,10 +172,13 @@ def pairs() -> ScanPairBatch:
 
 
 def test_the_gradient_equals_central_differences(pairs: ScanPairBatch) -> None:
-    model = JointScanCRF().double()
+    model = JointScanCRF(ModelConfig(features=FeatureConfig(reach="soft"))).double()
     random_stumps(model.boosters.data, 1)
     random_stumps(model.boosters.outlier, 2)
-    value = model.pseudo_log_likelihood(pairs).sum()
+    plugins = true_plugins(model.view(pairs).batch, 7)
+    reach = 3 * torch.rand(*plugins.label.shape, 7, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    plugins = replace(plugins, reach=reach)
+    value = model.pseudo_log_likelihood(pairs, plugins).sum()
     names, weights = zip(*model.named_parameters(), strict=True)
     slopes = torch.autograd.grad(value, weights)
     step = 1e-4
@@ -185,10 +188,11 @@ def test_the_gradient_equals_central_differences(pairs: ScanPairBatch) -> None:
         for sign in (1, -1):
             with torch.no_grad():
                 weight += sign * step
-                sides.append(float(model.pseudo_log_likelihood(pairs).sum()))
+                sides.append(float(model.pseudo_log_likelihood(pairs, plugins).sum()))
                 weight -= sign * step
         numeric = (sides[0] - sides[1]) / (2 * step)
         assert math.isclose(float(slope), numeric, rel_tol=1e-6, abs_tol=1e-6), name
+    assert slopes[names.index("clustering_weights.reach")] != 0
 
 
 @pytest.mark.parametrize("chain", ["association", "clustering"])
