@@ -120,7 +120,7 @@ def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generat
     """The training plug-ins of one batch; for CRF-Matching every point moves with the background."""
     view = model.view(part.batch)
     start = view.in_unit(part.start)
-    plugins = training_plugins(view.batch, start, config, generator, found_reach=view.reach == "soft")
+    plugins = training_plugins(view.batch, start, config, generator)
     if not model.config.has_clusters:
         plugins, start = pseudo_likelihood.for_background_alone(plugins), start.background_alone()
     return Lesson(view, start, plugins, part.fold)

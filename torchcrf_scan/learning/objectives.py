@@ -67,7 +67,7 @@ def labelled_chains(
     if start is None:
         plugins = features.true_plugins(view.batch, inference.clusters - 1)
     else:
-        plugins = training_plugins(view.batch, view.in_unit(start), config, generator, found_reach=view.reach == "soft")
+        plugins = training_plugins(view.batch, view.in_unit(start), config, generator)
     has_association, has_clusters = model.config.has_association, model.config.has_clusters
     if one_chain := ONE_CHAINS.get(model.config.coupling):
         yield model.config.coupling, one_chain(view, plugins, *learned), torch.cat([fitted.association, fitted.clustering])

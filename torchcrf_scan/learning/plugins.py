@@ -15,15 +15,11 @@ from torchcrf_scan.inference.start import Start, beyond_reach
 from torchcrf_scan.learning.settings import LearningConfig
 
 
-def training_plugins(
-    batch: ScanPairBatch, start: Start, config: LearningConfig, generator: torch.Generator, *, found_reach: bool = False
-) -> PlugIns:
+def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig, generator: torch.Generator) -> PlugIns:
     """True motions with noise for some pairs, InitialiseRT's for the others; spare slots hold its spurious movers (spec 2.5, 6.2).
 
-    A found motion replaces a true one if it moves that cluster's points nearly alike. Labels are the annotated ones.
-
-    found_reach: reaches of the found segments, as in use, for the movers that are found; else of all true points of each, within
-        which every true label is possible.
+    A found motion replaces a true one if it moves that cluster's points nearly alike. Labels are the annotated ones, and reaches are
+    those of the true points; with those of the found segments instead, the fitted model finds fewer movers.
     """
     truth = true_plugins(batch, start.motions.shape[1])
     noise = torch.randn(truth.motions.shape, generator=generator, dtype=torch.float64).to(truth.motions)
@@ -34,8 +30,7 @@ def training_plugins(
     found = torch.einsum("bgk,bkc->bgc", stands_for.to(noisy), start.motions)
     take = stands_for.any(-1) & use_start.to(noisy.device)[:, None]
     motions = torch.where(take[..., None], found, noisy)
-    plugins = fill_spare_slots(replace(truth, motions=motions), batch, start, stands_for)
-    return replace(plugins, reach=as_found(plugins.reach, start.reach, stands_for)) if found_reach else plugins
+    return fill_spare_slots(replace(truth, motions=motions), batch, start, stands_for)
 
 
 def match_start(batch: ScanPairBatch, start: Start, truth: PlugIns) -> Tensor:
@@ -68,14 +63,6 @@ def fill_spare_slots(plugins: PlugIns, batch: ScanPairBatch, start: Start, stand
         if start.reach is not None:
             reach[b][:, free[:many]] = start.reach[b][:, extra[:many]]
     return replace(plugins, motions=motions, active=active, reach=None if start.reach is None else reach)
-
-
-def as_found(reach: Tensor | None, found: Tensor | None, stands_for: Tensor) -> Tensor | None:
-    """(B, N, C) reaches of the found segments (B, N, C) where one stands for the cluster, else those given; None: none are."""
-    if reach is None or found is None:
-        return None
-    matched = torch.einsum("bgk,bnk->bng", stands_for.to(found), found)
-    return torch.where(stands_for.any(-1)[:, None], matched, reach)
 
 
 def reach_of_truth(plugins: PlugIns, batch: ScanPairBatch) -> Tensor:
