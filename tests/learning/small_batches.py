@@ -116,6 +116,7 @@ def random_case(seed: int, dtype: torch.dtype = torch.float64) -> Case:
             learn_stumps=smooth > 0 and bool(choose(True, False)),
             embedding=embedding,
             length_unit=str(choose("metre", "spacing")),
+            reach=("hard", "soft", "off")[seed % 3],
             left_out=(),
         ),
         inference=InferenceConfig(

@@ -18,8 +18,8 @@ from torchcrf_scan.learning.settings import LearningConfig
 def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig, generator: torch.Generator) -> PlugIns:
     """True motions with noise for some pairs, InitialiseRT's for the others; spare slots hold its spurious movers (spec 2.5, 6.2).
 
-    A found motion replaces a true one if it moves that cluster's points nearly alike. Labels are the annotated ones, and reaches are
-    those of the true points; with those of the found segments instead, the fitted model finds fewer movers.
+    A found motion replaces a true one if it moves that cluster's points nearly alike. Labels are the annotated ones, and reaches
+    those of the true points: with those of the found segments the fitted model finds fewer movers.
     """
     truth = true_plugins(batch, start.motions.shape[1])
     noise = torch.randn(truth.motions.shape, generator=generator, dtype=torch.float64).to(truth.motions)
