@@ -283,13 +283,14 @@ def clustering_extension(
     back: Sequence[Sequence[float]],
     gate: float,
     is_inlier: bool,
+    reaches: Sequence[float],
 ) -> np.ndarray:
-    """(D, 8) of one point: gate, outlier bias, seen through, so back, hidden, so back, outlier seen through, outlier hidden."""
+    """(D, 9) of one point: gate, outlier bias, seen through, so back, hidden, so back, outlier seen through, so hidden, reach."""
     rows = []
-    for residual, (seen, hidden), (seen_back, hidden_back) in zip(residuals, ahead, back, strict=True):
+    for residual, (seen, hidden), (seen_back, hidden_back), reach in zip(residuals, ahead, back, reaches, strict=True):
         of_partner = (seen_back, hidden_back) if is_inlier else (0.0, 0.0)
-        rows.append([-past_gate(residual, gate), 0, -seen, -of_partner[0], -hidden, -of_partner[1], 0, 0])
-    return np.array([*rows, [0, 1, 0, 0, 0, 0, *ahead[0]]], dtype=float)
+        rows.append([-past_gate(residual, gate), 0, -seen, -of_partner[0], -hidden, -of_partner[1], 0, 0, -min(reach**2, 9)])
+    return np.array([*rows, [0, 1, 0, 0, 0, 0, *ahead[0], 0]], dtype=float)
 
 
 def invert(motion: Sequence[float], point: Sequence[float]) -> tuple[float, float]:
@@ -299,12 +300,21 @@ def invert(motion: Sequence[float], point: Sequence[float]) -> tuple[float, floa
 
 
 def lattice_extension(
-    source: np.ndarray, target: np.ndarray, motions: np.ndarray, possible: np.ndarray, scales: dict[str, Any], noise: float
+    source: np.ndarray,
+    target: np.ndarray,
+    motions: np.ndarray,
+    possible: np.ndarray,
+    scales: dict[str, Any],
+    noise: float,
+    reach: np.ndarray,
 ) -> np.ndarray:
-    """(N, A D, 13) extensions of every super-node, the association's before the clustering's; open scans seen from 0."""
+    """(N, A D, 14) extensions of every super-node, the association's before the clustering's; open scans seen from 0.
+
+    possible: (N, C). reach: (N, C), the feature's.
+    """
     N, M, C = len(source), len(target), len(motions)
     before, after = (source, (0.0, 0.0), False, noise), (target, (0.0, 0.0), False, noise)
-    out = np.zeros((N, M + 1, C + 1, 13))
+    out = np.zeros((N, M + 1, C + 1, 14))
     for i in range(N):
         moved = [move(g, source[i]) for g in motions]
         apart = [[math.dist(p, q) for q in target] for p in moved]
@@ -316,8 +326,8 @@ def lattice_extension(
         for j in range(M + 1):
             residuals = [row[j] if j < M else min(row) for row in apart]
             back = [look(before, invert(g, target[j % M])) for g in motions]
-            out[i, j, :, 5:] = clustering_extension(residuals, ahead, back, scales["gate"], j < M)
-    return out.reshape(N, -1, 13)
+            out[i, j, :, 5:] = clustering_extension(residuals, ahead, back, scales["gate"], j < M, reach[i])
+    return out.reshape(N, -1, 14)
 
 
 def stump_sum(

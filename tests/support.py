@@ -9,7 +9,7 @@ from torch import Tensor
 
 # Where the paper's weights are among all; between them stand the extensions' (`features.scales`).
 PAPER_ASSOCIATION = [*range(14), *range(19, 23)]
-PAPER_CLUSTERING = [*range(4), *range(12, 20)]
+PAPER_CLUSTERING = [*range(4), *range(13, 21)]
 PAPER_WEIGHTS = [*PAPER_ASSOCIATION, *(23 + k for k in PAPER_CLUSTERING)]  # of both chains in a row
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-9}  # relative and absolute
 
@@ -33,13 +33,13 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 
 
 def extended(weights: Tensor) -> Tensor:
-    """The paper's 18, 12 or 30 weights among those of the extensions, which are 0: (23,), (20,) or (43,)."""
+    """The paper's 18, 12 or 30 weights among those of the extensions, which are 0: (23,), (21,) or (44,)."""
     places = {len(where): where for where in (PAPER_ASSOCIATION, PAPER_CLUSTERING, PAPER_WEIGHTS)}[len(weights)]
     return weights.new_zeros(places[-1] + 1).index_put((torch.tensor(places),), weights)
 
 
 def paper_weights(association_seed: int, clustering_seed: int) -> tuple[Tensor, Tensor]:
-    """(23,) and (20,): random weights of the paper's features, none of the extensions'."""
+    """(23,) and (21,): random weights of the paper's features, none of the extensions'."""
     return extended(normal(18, seed=association_seed)), extended(normal(12, seed=clustering_seed))
 
 

@@ -24,7 +24,7 @@ from torchcrf_scan import (
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.start import Start, beyond_reach
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 
 ASSOCIATION = (
@@ -40,11 +40,11 @@ CLUSTERING = (
 ASSOCIATION_EXTENSION = ("excess", "gate", "outlier_bias", "outlier_seen_through", "outlier_hidden")
 CLUSTERING_EXTENSION = (
     *("gate", "outlier_bias", "seen_through", "seen_through_back", "hidden", "hidden_back"),
-    *("outlier_seen_through", "outlier_hidden"),
+    *("outlier_seen_through", "outlier_hidden", "reach"),
 )
 FREE_SPACE = ("seen_through", "hidden")  # all names of such weights have one of them
 PAPER = FeatureConfig(free_space=False, decisions=False, left_out=())
-EVERYTHING = FeatureConfig(left_out=())
+EVERYTHING = FeatureConfig(left_out=(), reach="soft")
 SOFT = {"motion_weights": "soft", "temperature": 1.0, "stop_early": False, "candidates": 0}
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3]], dtype=torch.float64)
 
@@ -114,7 +114,7 @@ def test_thirty_named_weights_in_the_papers_order() -> None:
     assert (len(ASSOCIATION), len(CLUSTERING)) == (18, 12)
     assert len(list(model.parameters())) == 30
     assert all(weight.shape == () for weight in model.parameters())
-    assert [len(vector) for vector in model.weight_vectors] == [23, 20]
+    assert [len(vector) for vector in model.weight_vectors] == [23, 21]
 
 
 def test_the_parameters_keep_the_papers_order() -> None:
@@ -123,29 +123,31 @@ def test_the_parameters_keep_the_papers_order() -> None:
     assert tuple(model.clustering_weights) == CLUSTERING
 
 
-def test_thirteen_more_weights_stand_between_unary_and_pairwise_ones() -> None:
-    model = JointScanCRF()
+def test_fourteen_more_weights_stand_between_unary_and_pairwise_ones() -> None:
+    model = JointScanCRF(ModelConfig(features=EVERYTHING))
     assert tuple(ASSOCIATION_WEIGHTS) == (*ASSOCIATION[:14], *ASSOCIATION_EXTENSION, *ASSOCIATION[14:])
     assert tuple(CLUSTERING_WEIGHTS) == (*CLUSTERING[:4], *CLUSTERING_EXTENSION, *CLUSTERING[4:])
     assert tuple(model.association_weights) == ASSOCIATION_WEIGHTS
     assert tuple(model.clustering_weights) == CLUSTERING_WEIGHTS
-    assert len(list(model.parameters())) == 43
+    assert len(list(model.parameters())) == 44
 
 
 @pytest.mark.parametrize("free_space", [True, False])
 @pytest.mark.parametrize("decisions", [True, False])
-def test_each_group_of_extensions_has_a_switch(free_space: bool, decisions: bool, tmp_path: Path) -> None:
-    features = FeatureConfig(free_space=free_space, decisions=decisions, left_out=())
+@pytest.mark.parametrize("reach", ["hard", "soft", "off"])
+def test_each_group_of_extensions_has_a_switch(free_space: bool, decisions: bool, reach: str, tmp_path: Path) -> None:
+    features = FeatureConfig(free_space=free_space, decisions=decisions, reach=reach, left_out=())
     model = randomise(JointScanCRF(ModelConfig(features=features)))
-    has = {True: free_space, False: decisions}
+    has = {"beams": free_space, "reach": reach == "soft"}
     for names, paper, weights, vector in (
         (ASSOCIATION_WEIGHTS, ASSOCIATION, model.association_weights, model.weight_vectors[0]),
         (CLUSTERING_WEIGHTS, CLUSTERING, model.clustering_weights, model.weight_vectors[1]),
     ):
-        own = [name for name in names if name in paper or has[any(part in name for part in FREE_SPACE)]]
+        group = {name: "beams" if any(part in name for part in FREE_SPACE) else name for name in names}
+        own = [name for name in names if name in paper or has.get(group[name], decisions)]
         assert list(weights) == own
         assert [name for name, value in zip(names, vector.tolist(), strict=True) if value != 0] == own
-    assert len(list(model.parameters())) == 30 + 5 * decisions + 8 * free_space
+    assert len(list(model.parameters())) == 30 + 5 * decisions + 8 * free_space + (reach == "soft")
     model.save_pretrained(tmp_path)
     again = JointScanCRF.from_pretrained(tmp_path)
     assert again.config == model.config
@@ -369,6 +371,8 @@ def test_gradients_reach_weights_and_points(what: str, metric: str) -> None:
     batch, start = tiny()
     source, target = batch.source.clone().requires_grad_(), batch.target.clone().requires_grad_()
     model = soft_model(metric)
+    halves = (torch.arange(10) >= 5) == torch.tensor([[False], [True]])
+    start = replace(start, reach=beyond_reach(source, halves[None], torch.tensor([0.05]).double()))
     found = getattr(model(replace(batch, source=source, target=target), start), what)
     value = total(found) if what != "motions" else (found * torch.tensor([3.0, 1.0, 2.0])).sum()
     value.backward()
@@ -403,6 +407,7 @@ def test_gradients_of_padded_simulated_pairs_are_finite(pairs: list[ScanPair]) -
 @pytest.mark.parametrize("metric", ["point", "line"])
 def test_gradcheck_of_the_unrolled_rounds_in_the_weights(metric: str) -> None:
     batch, start = tiny(6)
+    start = replace(start, reach=(4 * normal(1, 6, 2, seed=5)).clamp(0, 3))
     model = soft_model(metric)
     names = [name for name, _ in model.named_parameters()]
 
@@ -421,7 +426,9 @@ def test_gradcheck_of_the_unrolled_rounds_in_the_points(metric: str) -> None:
     model = soft_model(metric, free_space=False)  # no gradient passes through what the beams say
 
     def answers(source: Tensor, target: Tensor) -> tuple[Tensor, ...]:
-        found = model(replace(batch, source=source, target=target), start)
+        halves = (torch.arange(6) >= 3) == torch.tensor([[False], [True]])
+        begun = replace(start, reach=beyond_reach(source, halves[None], torch.tensor([0.05]).double()))
+        found = model(replace(batch, source=source, target=target), begun)
         return found.log_association.exp(), found.log_cluster.exp(), found.motions
 
     assert torch.autograd.gradcheck(answers, (batch.source.requires_grad_(), batch.target.requires_grad_()), atol=1e-6)

@@ -87,6 +87,8 @@ class FeatureConfig:
         free_space: free-space and occlusion features, as extension weights of both chains (design finding 13).
         decisions: features for the inlier/outlier decision and for the nearest target point, as extension weights of both chains:
             a gate on the residual, a constant, the excess over the nearest. This and `free_space` off: the paper's 30.
+        reach: how a point's distance from the segment that a mover was found by (`Start.reach`) bears on its cluster: `soft`, an
+            extension weight of the clustering chain; `hard`, a mover is impossible beyond the segment's reach; `off`, not at all.
         left_out: features left out of the model, as `association.NAME` or `clustering.NAME` of a weight; a local channel is
             then hidden from the boosters too. By default the two that compare an edge's length, which reject sparsely sampled
             surfaces as outliers, and the decisions of the clustering chain, which cost it movers.
@@ -106,6 +108,7 @@ class FeatureConfig:
 
     free_space: bool = True
     decisions: bool = True
+    reach: Annotated[str, OneOf("hard", "soft", "off")] = "hard"
     left_out: tuple[Annotated[str, OneOf(*WEIGHTS)], ...] = LEFT_OUT
     length_unit: Annotated[str, OneOf("spacing", "metre")] = "spacing"
     embedding: Annotated[str, OneOf("none", "dot", "cosine")] = "none"

@@ -101,7 +101,7 @@ class JointScanCRF(nn.Module):
 
     @property
     def weight_vectors(self) -> tuple[Tensor, Tensor]:
-        """(23,) and (20,): the weights in the order of `ASSOCIATION_WEIGHTS` and `CLUSTERING_WEIGHTS`, 0 for left-out features."""
+        """(23,) and (21,): the weights in the order of `ASSOCIATION_WEIGHTS` and `CLUSTERING_WEIGHTS`, 0 for left-out features."""
         none = torch.zeros_like(self.association_weights["sequence"])
         own = dict(self.association_weights.named_parameters()), dict(self.clustering_weights.named_parameters())
         association = torch.stack([own[0].get(name, none) for name in ASSOCIATION_WEIGHTS])
@@ -116,7 +116,8 @@ class JointScanCRF(nn.Module):
 
     def view(self, batch: ScanPairBatch, learned: LearnedInputs | None = None) -> PairView:
         """The batch prepared for the features, computed once. learned: output of `learned_inputs`."""
-        return PairView.of(batch, self.config.features.wrap_closed, self.config.features.length_unit, learned)
+        features = self.config.features
+        return PairView.of(batch, features.wrap_closed, features.length_unit, learned, features.reach)
 
     def learned_inputs(
         self,
@@ -335,8 +336,8 @@ class JointScanCRF(nn.Module):
 
         Args:
             name_or_path: a folder, or a name under `torchcrf_scan/weights`.
-            features: `smooth`, `learn_stumps` or `embedding` of `FeatureConfig` to change; weights missing in the saved model
-                are initialised as in a new one.
+            features: `smooth`, `learn_stumps`, `embedding` or `reach` of `FeatureConfig` to change; weights missing in the saved
+                model are initialised as in a new one.
             inference: fields of `InferenceConfig` to change, e.g. `candidates=0`, `backend="eager"`.
 
         Raises:
@@ -344,13 +345,14 @@ class JointScanCRF(nn.Module):
         """
         folder = find_weights(name_or_path)
         model = cls(read_config(folder, features or {}, inference))
-        load_state(model, folder, model.embedding_state if features else {})
+        load_state(model, folder, model.optional_state if features else {})
         return model.eval()
 
     @property
-    def embedding_state(self) -> dict[str, Tensor]:
-        """The part of the model's state that exists only with embeddings."""
-        return {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in EMBEDDING_WEIGHTS}
+    def optional_state(self) -> dict[str, Tensor]:
+        """The part of the model's state that exists only with embeddings or `reach` soft."""
+        optional = (*EMBEDDING_WEIGHTS, "reach")
+        return {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in optional}
 
 
 class MatchingCRF(JointScanCRF):

@@ -21,7 +21,8 @@ ASSOCIATION_WEIGHTS = (*ASSOCIATION_NODE, *ASSOCIATION_EDGE)  # a01..a14, the ex
 
 PAPERS_CLUSTER = ("cluster_distance", "outlier", "cluster_inlier_in", "cluster_inlier_out")
 ELASTIC = ("neighbour_stiffness_same", "neighbour_stiffness_different", "neighbour_distance_same")  # of the partners' distance
-CLUSTERING_NODE = (*PAPERS_CLUSTER, *CLUSTERING_DECISIONS, *CLUSTERING_FREE_SPACE)
+CLUSTERING_EXTENSION = (*CLUSTERING_DECISIONS, *CLUSTERING_FREE_SPACE, "reach")
+CLUSTERING_NODE = (*PAPERS_CLUSTER, *CLUSTERING_EXTENSION)
 CLUSTERING_EDGE = (
     *("sequence", "neighbour_weight_same", "neighbour_weight_different", *ELASTIC),
     *("neighbour_distance_different", "pairwise_outlier"),
@@ -37,4 +38,5 @@ DECISION_WEIGHTS = (
     *(f"association.{name}" for name in ASSOCIATION_DECISIONS),
     *(f"clustering.{name}" for name in CLUSTERING_DECISIONS),
 )
+REACH_WEIGHT = "clustering.reach"
 WEIGHTS = (*(f"association.{name}" for name in ASSOCIATION_WEIGHTS), *(f"clustering.{name}" for name in CLUSTERING_WEIGHTS))

@@ -70,6 +70,7 @@ def model_config(values: Any) -> ModelConfig:
             _drop_run_time(values["inference"])
         if isinstance(values.get("features"), dict):
             values["features"].setdefault("left_out", ())  # models saved before this setting existed have every feature
+            values["features"].setdefault("reach", "hard")  # and only this
     return from_values(ModelConfig, values, "model")
 
 

@@ -33,7 +33,7 @@ def started(batch: ScanPairBatch, *, reach: torch.Tensor | None = None) -> Start
     B, N, M = len(batch), batch.source.shape[1], batch.target.shape[1]
     active = torch.tensor([[True, True, False]]).expand(B, 3)
     log_odds = torch.tensor([[torch.inf, 0.7, -1.0]], dtype=torch.float64).expand(B, 3)
-    reach = torch.ones(B, N, 3, dtype=torch.bool) if reach is None else reach
+    reach = torch.zeros(B, N, 3, dtype=torch.float64) if reach is None else reach
     nothing = torch.full((B, N), -1), torch.zeros(B, M, 2, dtype=torch.float64)
     return Start(MOTIONS.expand(B, 3, 3), active, *nothing, reach, log_odds)
 
@@ -46,7 +46,7 @@ def scan_of(points: int) -> Scan:
 def test_compiled_code_sees_the_same(world: str) -> None:
     batch = simulated(world)
     offset = torch.tensor([[0.4, 2.0, -1.0]], dtype=torch.float64).expand(len(batch), 3)
-    reach = normal(len(batch), batch.source.shape[1], 3, seed=3) > 0
+    reach = normal(len(batch), batch.source.shape[1], 3, seed=3).clamp(min=0)
     for of, start in ((batch, started(batch)), (batch.displaced(offset), started(batch, reach=reach))):
         for found, expected in zip(aligned_inputs(of, start, "compiled"), aligned_inputs(of, start, "eager"), strict=True):
             assert_close(found, expected, tolerance=1e-9)
@@ -104,7 +104,7 @@ def test_the_nearest_point_is_that_of_all_where_it_is_near() -> None:
 
 def test_movers_count_where_they_are_within_reach() -> None:
     batch = simulated(count=1)
-    nowhere = torch.zeros(1, batch.source.shape[1], 3, dtype=torch.bool)
+    nowhere = torch.ones(1, batch.source.shape[1], 3, dtype=torch.float64)
     inputs = aligned_inputs(batch, started(batch, reach=nowhere), "eager")[0][batch.source_mask]
     assert (channel(inputs, "probability of that mover") == 0).all()
     assert_close(channel(inputs, "distance under the best mover").exp(), torch.full((len(inputs),), 1 + FARTHEST))

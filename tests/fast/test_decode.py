@@ -17,7 +17,7 @@ from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.fast import arrays, decode
-from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.start import FARTHEST, Start
 from torchcrf_scan.loops.pair import pair_of
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.search.pairs import start_arrays
@@ -141,6 +141,23 @@ def test_metres_and_starts_without_odds_are_decoded_alike() -> None:
     assert_same_answer(compiled(model, batch, start), model(batch, start))
 
 
+@pytest.mark.parametrize(("reach", "weight"), [("soft", 0.0), ("soft", 0.3), ("soft", 3.0), ("off", 0.0)])
+@pytest.mark.parametrize("seed", [0, 2])
+def test_reaches_are_decoded_alike(reach: str, weight: float, seed: int) -> None:
+    model, batch = JointScanCRF.from_pretrained(backend="eager", features={"reach": reach}).double(), simulated(seed)
+    model.requires_grad_(False)
+    if reach == "soft":
+        assert model.clustering_weights["reach"] == 0
+        model.clustering_weights["reach"].fill_(weight)
+    start = model.initialise(batch)
+    assert ((start.reach > 0) & (start.reach < FARTHEST)).any()  # something in between
+    expected = model(batch, start)
+    assert_same_answer(compiled(model, batch, start), expected)
+    if weight == 0:
+        blind = layer()(batch, replace(start, reach=None))
+        np.testing.assert_array_equal(expected.cluster, blind.cluster)
+
+
 def test_real_pairs_are_decoded_alike(real_pairs_dir: Path) -> None:
     for file in sorted(real_pairs_dir.glob("*.npz"))[::EVERY]:
         batch = ScanPairBatch.collate([read_pair(file)], torch.float64).without_truth()
@@ -160,7 +177,7 @@ def begin(batch: ScanPairBatch, seed: int) -> Start:
     tangents = torch.nn.functional.normalize(normal(1, m, 2, seed=seed), dim=-1)
     active = torch.tensor([[True, True, False]])
     log_odds = torch.tensor([[torch.inf, 1.0, -torch.inf]], dtype=torch.float64)
-    reach = torch.ones(1, n, 3, dtype=torch.bool)
+    reach = normal(1, n, 3, seed=seed + 1).clamp(min=0) * torch.tensor([0.0, 1.0, 1.0])
     return Start(0.1 * normal(1, 3, 3, seed=seed), active, association, tangents, reach, log_odds)
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchcrf_scan import JointScanCRF
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.fast import clustering
+from torchcrf_scan.fast.decode import limited
 from torchcrf_scan.fast.free_space import Sweep, sweep_of
 from torchcrf_scan.features import clustering as eager
 from torchcrf_scan.features.candidates import by_motion
@@ -31,13 +32,13 @@ def fitted() -> Parameters:
 
 PARAMETERS = {
     "fitted": fitted,
-    "all features": lambda: replace(fitted(), clustering=normal(20, seed=1)),
-    "no beams": lambda: replace(fitted(), clustering=normal(20, seed=2).index_fill(0, torch.arange(6, 12), 0.0)),
+    "all features": lambda: replace(fitted(), clustering=normal(21, seed=1)),
+    "no beams": lambda: replace(fitted(), clustering=normal(21, seed=2).index_fill(0, torch.arange(6, 12), 0.0)),
 }
 
 
 class Case(NamedTuple):
-    view: PairView
+    view: PairView  # of `reach` soft or hard
     motions: Tensor
     active: Tensor
     reach: Tensor
@@ -55,11 +56,11 @@ def case(n: int, m: int, seed: int, points: str = "spread") -> Case:
     batch = ScanPairBatch(source[None], target[None], *masks, closed, closed, one / 10, one / 50, torch.zeros(1, 3).double())
     motions = 0.1 * normal(1, C, 3, seed=seed)
     active = torch.tensor([[True, False, True, seed % 3 > 0]])
-    reach = torch.rand(1, n, C, generator=generator(seed)) < 0.7
-    reach[..., 0] = True
+    reach = (4 * torch.rand(1, n, C, generator=generator(seed), dtype=torch.float64) - 2.8).clamp(min=0)
+    reach[..., 0] = 0
     association = torch.randint(-1, m, (1, n), generator=generator(seed))
     nearest = by_motion(batch.source, batch.target, batch.target_mask, motions, active, 1).nearest
-    return Case(PairView.of(batch), motions, active, reach, association, nearest)
+    return Case(PairView.of(batch, reach=("hard", "soft")[seed // 2 % 2]), motions, active, reach, association, nearest)
 
 
 def array(values: Tensor) -> Any:
@@ -75,6 +76,7 @@ def sweeps(view: PairView) -> tuple[Sweep, Sweep]:
 def tables(at: Case, model: clustering.ClusteringModel) -> clustering.Tables:
     source, target, association = array(at.view.batch.source), array(at.view.batch.target), array(at.association)
     motions, active, reach = array(at.motions), array(at.active), array(at.reach)
+    reach = limited(reach) if at.view.reach == "hard" else reach
     nearest = clustering.nearest_to_outliers(boxes_of(target), source, motions, active, association)
     return clustering.tabulate(source, target, *sweeps(at.view), motions, active, reach, association, nearest, model)
 
@@ -82,9 +84,9 @@ def tables(at: Case, model: clustering.ClusteringModel) -> clustering.Tables:
 def potentials(at: Case, parameters: Parameters) -> tuple[Tensor, Tensor]:
     batch, scales = at.view.batch, parameters.scales
     met = eager.correspond(batch.source, batch.target, at.motions, at.nearest, at.association)
-    local = clustering_unary(at.view, met, at.motions, at.active, scales)
+    local = clustering_unary(at.view, met, at.motions, at.active, scales, at.reach)
     pairwise = eager.pairwise_features(batch.source, met, scales)
-    possible = possible_clusters(at.active, at.reach, batch.source.shape[1])
+    possible = possible_clusters(at.active, at.view.within(at.reach), batch.source.shape[1])
     return clustering_potentials(local, pairwise, possible, parameters.clustering)
 
 

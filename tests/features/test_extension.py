@@ -76,11 +76,13 @@ def test_the_associations_equal_the_loops(B: int, N: int, K: int, seed: int) -> 
 def test_the_clusters_equal_the_loops(B: int, N: int, C: int, seed: int) -> None:
     scales, residual = make_scales(), 2 * random(B, N, C, seed=seed)
     ahead, back, is_inlier = sight(B, N, C, seed=seed), sight(B, N, C, seed=seed + 5), random(B, N, seed=seed) < 0.5
-    found = clustering_extension(residual, ahead, back, is_inlier, scales)
-    assert found.shape == (B, N, C + 1, 8)
+    reach = (4 * random(B, N, C, seed=seed + 7) - 1).clamp(0, 3)
+    found = clustering_extension(residual, ahead, back, is_inlier, reach, scales)
+    assert found.shape == (B, N, C + 1, 9)
     for b, i in np.ndindex(B, N):
         sights = both(ahead, b, i), both(back, b, i)
-        expected = oracles.clustering_extension(residual[b, i].tolist(), *sights, float(scales.gate), bool(is_inlier[b, i]))
+        inlier, reaches = bool(is_inlier[b, i]), reach[b, i].tolist()
+        expected = oracles.clustering_extension(residual[b, i].tolist(), *sights, float(scales.gate), inlier, reaches)
         assert_close(found[b, i], expected)
 
 
@@ -99,9 +101,9 @@ def test_features_have_the_names_of_their_weights() -> None:
         (everything, nothing, {"seen_through": -1, "hidden": -1}, {"outlier_seen_through": 1, "outlier_hidden": 1}),
         (nothing, everything, {"seen_through_back": -1, "hidden_back": -1}, {}),
     ):
-        found = clustering_extension(9 * one[..., None], ahead, back, is_inlier, scales)[0, 0]
+        found = clustering_extension(9 * one[..., None], ahead, back, is_inlier, 2 * one[..., None], scales)[0, 0]
         values = [dict(zip(cluster, row, strict=True)) for row in found.round().tolist()]
-        assert values[0] == dict.fromkeys(cluster, 0) | {"gate": -1} | inlier
+        assert values[0] == dict.fromkeys(cluster, 0) | {"gate": -1, "reach": -4} | inlier
         assert values[1] == dict.fromkeys(cluster, 0) | {"outlier_bias": 1} | outlier
 
 
@@ -149,10 +151,15 @@ def make_batch(seed: int = 0, n: int = 50, m: int = 40) -> ScanPairBatch:
 
 
 def features(
-    batch: ScanPairBatch, motions: Tensor, cluster: Tensor, association: Tensor, candidates: int = 0
+    batch: ScanPairBatch,
+    motions: Tensor,
+    cluster: Tensor,
+    association: Tensor,
+    candidates: int = 0,
+    reach: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Both chains' extensions (1, N, K+1, 5) and (1, N, D, 8) at motions (C, 3) and labels (N,), -1 moved with the background."""
-    view, scales, motions, cluster = PairView.of(batch), make_scales(), motions[None], cluster[None]
+    """Both chains' extensions (1, N, K+1, 5) and (1, N, D, 9) at motions (C, 3) and labels (N,), -1 moved with the background."""
+    view, scales, motions, cluster = PairView.of(batch, reach="soft"), make_scales(), motions[None], cluster[None]
     active = torch.ones(motions.shape[:2], dtype=torch.bool)
     found = find_candidates(view, motions, active, InferenceConfig(candidates=candidates))
     states = AssociationStates.of(view, found.index, found.mask, scales, Boosters(1).double())
@@ -160,10 +167,15 @@ def features(
     moved = se2.apply(own, batch.source[:, :, None])[:, :, 0]
     of_association = association_unary(view, states, moved, scales, Boosters(1).double())
     at = clustering.correspond(batch.source, batch.target, motions, found.nearest, association[None])
-    of_cluster = clustering_unary(view, at, motions, active, scales)
+    of_cluster = clustering_unary(view, at, motions, active, scales, reach_of(batch) if reach is None else reach)
     assert of_association.shape[-1] == ASSOCIATION_UNARY
     assert of_cluster.shape[-1] == CLUSTERING_UNARY
     return of_association[..., OF_ASSOCIATION], of_cluster[..., OF_CLUSTER]
+
+
+def reach_of(batch: ScanPairBatch) -> Tensor:
+    """(1, N, C) from 0 to 3."""
+    return (1 + 2 * torch.sin(batch.source.norm(dim=-1)[..., None] + torch.arange(len(MOTIONS)))).clamp(min=0)
 
 
 def labels(batch: ScanPairBatch, clusters: int = 3, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -176,7 +188,7 @@ def labels(batch: ScanPairBatch, clusters: int = 3, seed: int = 0) -> tuple[Tens
 def test_both_chains_look_where_they_should(seed: int) -> None:
     batch, scales = make_batch(seed), make_scales()
     cluster, association = labels(batch, seed=seed)
-    found = features(batch, MOTIONS, cluster, association)
+    found, reach = features(batch, MOTIONS, cluster, association), reach_of(batch)
     source, target, motions = batch.source[0].tolist(), batch.target[0].tolist(), MOTIONS.tolist()
     before, after = ((points, (0.0, 0.0), False, float(batch.range_noise)) for points in (source, target))
     for i, point in enumerate(source):
@@ -192,7 +204,10 @@ def test_both_chains_look_where_they_should(seed: int) -> None:
         residuals = [float(np.hypot(p[0] - q[0], p[1] - q[1])) for p, q in zip(moved, met, strict=True)]
         back = [oracles.look(before, oracles.invert(motion, target[partner])) for motion in motions]
         ahead = [oracles.look(after, p) for p in moved]
-        assert_close(found[1][0, i], oracles.clustering_extension(residuals, ahead, back, float(scales.gate), partner >= 0))
+        assert_close(
+            found[1][0, i],
+            oracles.clustering_extension(residuals, ahead, back, float(scales.gate), partner >= 0, reach[0, i].tolist()),
+        )
     for value in found:
         assert (value != 0).flatten(0, 2).any(0).all()  # nothing was left untried
 
@@ -203,7 +218,7 @@ def test_the_order_of_the_movers_is_the_order_of_the_features() -> None:
     order = [0, 2, 1]
     one = features(batch, MOTIONS, cluster, association)
     renamed = torch.tensor([*order, -1])[cluster]  # the permutation is its own inverse
-    other = features(batch, MOTIONS[order], renamed, association)
+    other = features(batch, MOTIONS[order], renamed, association, reach=reach_of(batch)[..., order])
     assert_close(other[0], one[0])
     assert_close(other[1], one[1][:, :, [*order, 3]])
 

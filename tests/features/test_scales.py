@@ -22,12 +22,14 @@ def dead(config: FeatureConfig) -> set[str]:
 )
 def test_what_is_left_out_is_dead_and_nothing_else(left_out: tuple[str, ...]) -> None:
     raw = {f"association.{name}" for name in LOCAL_CHANNELS}
-    assert dead(FeatureConfig(left_out=left_out)) == set(left_out)
-    assert dead(FeatureConfig(left_out=left_out, raw_channels=False)) == set(left_out) | raw
+    assert dead(FeatureConfig(left_out=left_out, reach="soft")) == set(left_out)
+    assert dead(FeatureConfig(left_out=left_out, reach="soft", raw_channels=False)) == set(left_out) | raw
+    for reach in ("hard", "off"):
+        assert dead(FeatureConfig(left_out=left_out, reach=reach)) == {*left_out, "clustering.reach"}
 
 
 def test_the_model_has_no_dead_weight_whatever_its_parameters_say() -> None:
-    model = JointScanCRF(ModelConfig(features=FeatureConfig(left_out=("association.geo1", "clustering.outlier"))))
+    model = JointScanCRF(ModelConfig(features=FeatureConfig(left_out=("association.geo1", "clustering.outlier"), reach="soft")))
     with torch.no_grad():
         for weight in model.parameters():
             weight.fill_(2.0)

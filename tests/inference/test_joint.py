@@ -36,10 +36,14 @@ def config(chains: str = "joint", **inference: object) -> ModelConfig:
 
 
 def decode(
-    batch: ScanPairBatch, start: Start, settings: ModelConfig | None = None, parameters: Parameters | None = None
+    batch: ScanPairBatch,
+    start: Start,
+    settings: ModelConfig | None = None,
+    parameters: Parameters | None = None,
+    reach: str = "hard",
 ) -> Prediction:
     with torch.no_grad():
-        return joint.decode(PairView.of(batch), start, parameters or MODEL.fitted, settings or config())
+        return joint.decode(PairView.of(batch, reach=reach), start, parameters or MODEL.fitted, settings or config())
 
 
 # --- exactness ----------------------------------------------------------------------------------------------------------------
@@ -107,19 +111,20 @@ def sharp_scales() -> Scales:
 @pytest.mark.parametrize("seed", range(4))
 def test_the_clustering_chain_with_its_extensions_equals_brute_force(seed: int, temperature: float) -> None:
     source, target = make_points(50, seed)[16:22], make_points(50, seed + 20)[18:23]  # dense, so that beams say something
-    batch, weights, scales = make_batch(source[None], target[None]), normal(20, seed=seed), sharp_scales()
+    batch, weights, scales = make_batch(source[None], target[None]), normal(21, seed=seed), sharp_scales()
     association = torch.randint(-1, 5, (1, 6), generator=generator(seed))
     settings = config("clustering", clusters=4, iterations=1, temperature=temperature, motion_metric="given")
     parameters = Parameters(normal(23), weights, scales, Boosters(1).double())
-    found = decode(batch, make_start(batch, MOTIONS, association), settings, parameters)
+    reach = 3 * torch.rand(1, 6, 3, generator=generator(seed + 9), dtype=torch.float64)
+    found = decode(batch, replace(make_start(batch, MOTIONS, association), reach=reach), settings, parameters, "soft")
     arrays, labels = (source.numpy(), target.numpy(), MOTIONS.numpy()), association[0].tolist()
     local = oracles.local_clustering(*arrays, [True] * 3, labels, 1.5, float(scales.outlier_threshold))
     plain, possible = {name: value.tolist() for name, value in scales.named_buffers()}, np.ones((6, 3), dtype=bool)
-    every = oracles.lattice_extension(*arrays, possible, plain, float(batch.range_noise)).reshape(6, 6, 4, 13)
+    every = oracles.lattice_extension(*arrays, possible, plain, float(batch.range_noise), reach[0].numpy()).reshape(6, 6, 4, 14)
     extension = np.array([every[i, j, :, 5:] for i, j in enumerate(labels)])  # -1 is the outlier, the last state
     pairwise = oracles.pairwise_clustering(*arrays, labels, float(scales.neighbour_weight), float(scales.neighbour_distance))
-    unary = np.concatenate([local, extension], axis=-1) @ weights[:12].numpy()
-    assert_close(found.log_cluster[0], oracles.log_marginals(unary, pairwise @ weights[12:].numpy(), temperature))
+    unary = np.concatenate([local, extension], axis=-1) @ weights[:13].numpy()
+    assert_close(found.log_cluster[0], oracles.log_marginals(unary, pairwise @ weights[13:].numpy(), temperature))
 
 
 @pytest.mark.parametrize("temperature", [0.0, 1.0])
@@ -128,14 +133,15 @@ def test_the_association_chain_with_its_extensions_equals_brute_force(seed: int,
     source, target = make_points(50, seed)[16:21], make_points(50, seed + 20)[18:22]
     batch, weights, scales = make_batch(source[None], target[None]), normal(23, seed=seed), sharp_scales()
     settings = config("matching", candidates=0, iterations=1, temperature=temperature, motion_metric="given")
-    parameters = Parameters(weights, normal(20), scales, Boosters(1).double())
+    parameters = Parameters(weights, normal(21), scales, Boosters(1).double())
     found = decode(batch, make_start(batch, MOTIONS[:1]), settings, parameters)
     moved = se2.apply(MOTIONS[0], source).numpy()
     local = oracles.local_association(source.numpy(), target.numpy(), scales.local.tolist(), [0.0, 0.0, 0.0], moved)
     outlier = np.broadcast_to(scales.local_outlier.numpy(), (5, 1, 12))
     plain, possible = {name: value.tolist() for name, value in scales.named_buffers()}, np.ones((5, 1), dtype=bool)
     arrays = source.numpy(), target.numpy(), MOTIONS[:1].numpy()
-    extension = oracles.lattice_extension(*arrays, possible, plain, float(batch.range_noise)).reshape(5, 5, 2, 13)[:, :, 0, :5]
+    every = oracles.lattice_extension(*arrays, possible, plain, float(batch.range_noise), np.zeros((5, 1)))
+    extension = every.reshape(5, 5, 2, 14)[:, :, 0, :5]
     unary = np.concatenate([local, outlier], axis=1) @ weights[:12].numpy() + extension @ weights[14:19].numpy()
     pairwise = oracles.pairwise_association(
         source.numpy(), target.numpy(), scales.pairwise.tolist(), scales.pairwise_outlier.tolist()

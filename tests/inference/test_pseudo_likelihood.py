@@ -12,7 +12,7 @@ from support import assert_close, extended, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
-from torchcrf_scan.config import InferenceConfig, ModelConfig
+from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.candidates import with_targets
@@ -155,7 +155,7 @@ def test_inactive_slots_are_no_alternative() -> None:
     batch = tiny()
     plugins = true_plugins(batch, 4)
     assert plugins.active.tolist() == [[True, True, False, False]]
-    weights = normal(20)
+    weights = normal(21)
     wide = clustering_design(PairView.of(batch), plugins, Scales().double()).log_likelihood(weights)
     narrow = clustering_design(PairView.of(batch), true_plugins(batch, 2), Scales().double()).log_likelihood(weights)
     assert_close(wide, narrow)
@@ -163,7 +163,7 @@ def test_inactive_slots_are_no_alternative() -> None:
 
 def test_the_joint_is_the_sum_of_both_chains() -> None:
     batch, scales, boosters = tiny(), Scales().double(), Boosters(1).double()
-    parameters = Parameters(normal(23), normal(20, seed=1), scales, boosters)
+    parameters = Parameters(normal(23), normal(21, seed=1), scales, boosters)
     view, plugins = PairView.of(batch), plugins_of(batch)
     first = association_design(view, plugins, scales, boosters, InferenceConfig()).log_likelihood(parameters.association).sum(-1)
     second = clustering_design(view, plugins, scales).log_likelihood(parameters.clustering).sum(-1)
@@ -181,23 +181,27 @@ def pairs() -> ScanPairBatch:
 
 
 def test_the_gradient_equals_central_differences(pairs: ScanPairBatch) -> None:
-    model = JointScanCRF().double()
+    model = JointScanCRF(ModelConfig(features=FeatureConfig(reach="soft"))).double()
     random_stumps(model.boosters.data, 1)
     random_stumps(model.boosters.outlier, 2)
-    value = model.pseudo_log_likelihood(pairs).sum()
+    plugins = true_plugins(model.view(pairs).batch, 7)
+    reach = 3 * torch.rand(*plugins.label.shape, 7, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    plugins = replace(plugins, reach=reach)
+    value = model.pseudo_log_likelihood(pairs, plugins).sum()
     names, weights = zip(*model.named_parameters(), strict=True)
     slopes = torch.autograd.grad(value, weights)
     step = 1e-4
-    assert len(names) == 43
+    assert len(names) == 44
     for name, weight, slope in zip(names, weights, slopes, strict=True):
         sides = []
         for sign in (1, -1):
             with torch.no_grad():
                 weight += sign * step
-                sides.append(float(model.pseudo_log_likelihood(pairs).sum()))
+                sides.append(float(model.pseudo_log_likelihood(pairs, plugins).sum()))
                 weight -= sign * step
         numeric = (sides[0] - sides[1]) / (2 * step)
         assert math.isclose(float(slope), numeric, rel_tol=1e-6, abs_tol=1e-6), name
+    assert slopes[names.index("clustering_weights.reach")] != 0
 
 
 @pytest.mark.parametrize("chain", ["association", "clustering"])
@@ -248,7 +252,7 @@ def test_unknown_nodes_say_nothing_and_do_not_count(node: int) -> None:
     assert float(first.log_likelihood(weights)[0, node]) == 0
     assert_close(second.log_likelihood(weights), first.log_likelihood(weights))
     clustering = designs(one)[1]
-    assert float(clustering.log_likelihood(normal(20))[0, node]) == 0
+    assert float(clustering.log_likelihood(normal(21))[0, node]) == 0
     edges = slice(CLUSTERING_UNARY, None)
     full = designs(tiny())[1].features[0, :, :, edges]
     for neighbour in {node - 1, node + 1} & set(range(N)):
@@ -299,7 +303,7 @@ def test_padding_does_not_count() -> None:
             torch.arange(N + 3)[None] < N,
         ),
     )
-    for one, other, width in zip(designs(batch), designs(padded), (23, 20), strict=True):
+    for one, other, width in zip(designs(batch), designs(padded), (23, 21), strict=True):
         assert_close(other.log_likelihood(normal(width))[:, :N], one.log_likelihood(normal(width)))
         assert (other.log_likelihood(normal(width))[:, N:] == 0).all()
 

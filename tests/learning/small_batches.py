@@ -98,7 +98,7 @@ def random_case(seed: int, dtype: torch.dtype = torch.float64) -> Case:
     association = torch.stack([torch.full((N,), -1) if k == "all outliers" else a for k, a in zip(kinds, association, strict=True)])
     more: dict[str, Tensor] = {}
     if choose(True, False):
-        more["reach"] = (torch.rand(B, N, C, generator=draw) < 0.7) | (torch.arange(C) == 0)
+        more["reach"] = (4 * torch.rand(B, N, C, generator=draw) - 2.8).clamp(min=0).to(dtype) * (torch.arange(C) > 0)
     if choose(True, False):
         more["log_odds"] = numbers(B, C).masked_fill(torch.rand(B, C, generator=draw) < 0.3, -torch.inf)
         more["log_odds"][:, 0] = torch.inf
@@ -116,6 +116,7 @@ def random_case(seed: int, dtype: torch.dtype = torch.float64) -> Case:
             learn_stumps=smooth > 0 and bool(choose(True, False)),
             embedding=embedding,
             length_unit=str(choose("metre", "spacing")),
+            reach=("hard", "soft", "off")[seed % 3],
             left_out=(),
         ),
         inference=InferenceConfig(

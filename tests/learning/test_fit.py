@@ -122,11 +122,11 @@ def test_the_literal_reading_learns_no_raw_weight(material: list[Material]) -> N
 
 
 def test_set_weights_follows_the_names() -> None:
-    model = JointScanCRF()
+    model = JointScanCRF(ModelConfig(features=FeatureConfig(reach="soft")))
     set_weights(model, "association", torch.arange(23.0))
-    set_weights(model, "clustering", torch.arange(20.0))
+    set_weights(model, "clustering", torch.arange(21.0))
     assert [model.association_weights[name].item() for name in ASSOCIATION_WEIGHTS] == list(range(23))
-    assert [model.clustering_weights[name].item() for name in CLUSTERING_WEIGHTS] == list(range(20))
+    assert [model.clustering_weights[name].item() for name in CLUSTERING_WEIGHTS] == list(range(21))
     with pytest.raises(ValueError, match="zip"):
         set_weights(model, "clustering", torch.arange(23.0))
 
@@ -134,7 +134,7 @@ def test_set_weights_follows_the_names() -> None:
 def test_set_weights_passes_over_what_the_model_does_not_have() -> None:
     model = JointScanCRF(ModelConfig(features=FeatureConfig(free_space=False, decisions=False, left_out=())))
     set_weights(model, "association", torch.arange(23.0))
-    set_weights(model, "clustering", torch.arange(20.0))
+    set_weights(model, "clustering", torch.arange(21.0))
     assert [weight.item() for weight in model.parameters()] == [*PAPER_ASSOCIATION, *PAPER_CLUSTERING]
 
 
@@ -152,7 +152,7 @@ def test_what_is_left_out_is_not_learned(layer: type[JointScanCRF], material: li
     chain, names = ("association", ASSOCIATION_WEIGHTS) if layer is MatchingCRF else ("clustering", CLUSTERING_WEIGHTS)
     learned = dict(zip(names, model.weight_vectors[chain == "clustering"].tolist(), strict=True))
     assert {f"{chain}.{name}" for name, value in learned.items() if value == 0} == {
-        name for name in (*left_out, *FREE_SPACE_WEIGHTS) if name.startswith(chain)
+        name for name in (*left_out, *FREE_SPACE_WEIGHTS, "clustering.reach") if name.startswith(chain)
     }
     inputs = -9 * torch.rand(100, len(LOCAL_CHANNELS))
     changed = inputs.clone()
@@ -168,4 +168,4 @@ def test_a_lattice_does_not_learn_what_is_left_out(material: list[Material]) -> 
         [name for name, value in zip(names, weights.tolist(), strict=True) if value == 0]
         for names, weights in zip((ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS), model.weight_vectors, strict=True)
     ]
-    assert dead == [["translation"], ["pairwise_outlier"]]
+    assert dead == [["translation"], ["reach", "pairwise_outlier"]]

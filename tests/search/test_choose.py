@@ -8,7 +8,7 @@ from surveyed import SCENES, survey
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.features.potentials import resolution
-from torchcrf_scan.inference.start import nearest_association, within_reach
+from torchcrf_scan.inference.start import beyond_reach, nearest_association
 from torchcrf_scan.loops.pair import Pair, PairStart
 from torchcrf_scan.search.accept import probabilities_of, score_of, select
 from torchcrf_scan.search.choose import CONSIDERED, FEWEST_POINTS, choose_movers
@@ -51,8 +51,9 @@ def test_the_start_is_put_together_from_what_was_found(name: str, clusters: int)
     assert_close(start.target_tangents, at.target.tangent if is_enough else np.zeros_like(at.pair.target))
     members = np.zeros((1, clusters, N), np.bool_)
     members[0, 1 : G + 1] = members_of(at.found, movers, N)
-    reach = within_reach(batch.source, torch.from_numpy(members), resolution(batch))
-    assert start.reach.tolist() == reach[0].tolist()
+    reach = beyond_reach(batch.source, torch.from_numpy(members), resolution(batch))
+    assert_close(start.reach, reach[0], tolerance=1e-9)
+    assert (start.reach <= 0).tolist() == (reach[0] <= 0).tolist()
     given = torch.from_numpy(start.motions)[None], torch.from_numpy(start.active)[None], reach
     assert start.association.tolist() == nearest_association(batch, *given)[0].tolist()
     assert not any(np.isnan(values).any() for values in start)

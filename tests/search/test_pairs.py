@@ -12,7 +12,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.start import FARTHEST, Start
 from torchcrf_scan.loops.pair import PairStart, pair_of
 from torchcrf_scan.scan import Scan, ScanPair
 from torchcrf_scan.search.accept import score_of
@@ -164,8 +164,8 @@ def test_padding_is_no_point(pairs: list[ScanPair], found: Start) -> None:
     assert found.reach is not None
     assert (found.association[~batch.source_mask] == -1).all()
     assert (found.target_tangents[~batch.target_mask] == 0).all()
-    assert found.reach[..., 0].all()
-    assert not found.reach[~batch.source_mask][:, 1:].any()
+    assert (found.reach[..., 0] == 0).all()
+    assert (found.reach[~batch.source_mask][:, 1:] == FARTHEST).all()
 
 
 @pytest.mark.parametrize("empty", ["both", "source", "target"])

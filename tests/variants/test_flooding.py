@@ -50,7 +50,7 @@ def random_case(chains: str, pairs: int = 4) -> tuple[ScanPairBatch, Start, Para
     motions = motions.expand(pairs, -1, 3)
     association = torch.randint(-1, M, (pairs, N), generator=generator(1))
     start = Start(motions, torch.ones(motions.shape[:2], dtype=torch.bool), association, torch.zeros_like(batch.target))
-    return batch, start, Parameters(normal(23, seed=3), normal(20, seed=4), Scales().double(), Boosters(1).double())
+    return batch, start, Parameters(normal(23, seed=3), normal(21, seed=4), Scales().double(), Boosters(1).double())
 
 
 def config(chains: str = "joint", **inference: object) -> ModelConfig:
@@ -109,7 +109,7 @@ def test_ascending_iterations_are_exact_after_as_many_as_there_are_nodes(chains:
 @pytest.mark.parametrize("chains", CHAINS)
 def test_nothing_is_settled_before_every_message_has_arrived(chains: str, order: str) -> None:
     batch, start, parameters = random_case(chains, 32)
-    parameters = replace(parameters, association=normal(23, seed=6) / 2, clustering=normal(20, seed=106) / 2)
+    parameters = replace(parameters, association=normal(23, seed=6) / 2, clustering=normal(21, seed=106) / 2)
     settings = {"clusters": start.motions.shape[1] + 1, "candidates": 3}
     view = PairView.of(batch)
     exact = joint.decode(view, start, parameters, config(chains, **settings, iterations=1))

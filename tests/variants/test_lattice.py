@@ -234,13 +234,20 @@ def loose_scales() -> Scales:
 
 
 def features_of(
-    batch: ScanPairBatch, motions: Tensor, possible: Tensor, scales: Scales, boosters: Boosters, candidates: int = 0
+    batch: ScanPairBatch,
+    motions: Tensor,
+    possible: Tensor,
+    scales: Scales,
+    boosters: Boosters,
+    candidates: int = 0,
+    reach: Tensor | None = None,
+    mode: str = "hard",
 ) -> LatticeFeatures:
-    view, motions = PairView.of(batch), motions.expand(len(batch), -1, -1)
+    view, motions = PairView.of(batch, reach=mode), motions.expand(len(batch), -1, -1)
     active = torch.ones(motions.shape[:2], dtype=torch.bool)
     found = find_candidates(view, motions, active, InferenceConfig(candidates=candidates))
     states = AssociationStates.of(view, found.index, found.mask, scales, boosters)
-    return lattice_features(view, states, motions, found.nearest, possible, scales, boosters)
+    return lattice_features(view, states, motions, found.nearest, possible, scales, boosters, reach)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -266,7 +273,7 @@ def test_the_potentials_of_a_toy_equal_the_loops_and_so_does_the_answer(seed: in
 
     if M == 2:  # nine states a node: 6561 labellings
         parameters = Parameters(extended(weights[:18]), extended(weights[18:]), scales, boosters)
-        start = replace(make_start(batch, MOTIONS[:C]), reach=reach)
+        start = replace(make_start(batch, MOTIONS[:C]), reach=(~reach).double())
         answer = decode(batch, start, config(clusters=C + 1, candidates=0, iterations=1), parameters)
         best = np.array(oracles.best_labelling(unary, pairwise))
         j, k = best // (C + 1), best % (C + 1)
@@ -276,33 +283,35 @@ def test_the_potentials_of_a_toy_equal_the_loops_and_so_does_the_answer(seed: in
 
 @pytest.mark.parametrize("seed", range(4))
 def test_with_extensions_they_equal_the_loops_too_and_so_does_the_answer(seed: int) -> None:
-    N, M, C = 4, 2 + seed % 2 * 3, 2
+    N, M, C, mode = 4, 2 + seed % 2 * 3, 2, ("soft", "hard")[seed // 2]
     source, target = make_points(50, seed)[16 : 16 + N], make_points(50, seed + 20)[18 : 18 + M]  # dense: beams say something
     batch = make_batch(source[None], target[None])
-    scales, boosters, weights = loose_scales(), Boosters(1).double(), normal(43, seed=seed)
+    scales, boosters, weights = loose_scales(), Boosters(1).double(), normal(44, seed=seed)
     scales.gate.fill_(1.2)
-    reach = torch.rand(1, N, C, generator=generator(seed)) < 0.6
-    reach[..., 0] = True
-    possible = possible_clusters(torch.ones(1, C, dtype=torch.bool), reach, N)
-    found = features_of(batch, MOTIONS[:C], possible, scales, boosters).potentials(weights)
+    reach = (4 * torch.rand(1, N, C, generator=generator(seed), dtype=torch.float64) - 2).clamp(min=0)
+    reach[..., 0] = 0
+    within = PairView.of(batch, reach=mode).within(reach)
+    possible = possible_clusters(torch.ones(1, C, dtype=torch.bool), within, N)
+    found = features_of(batch, MOTIONS[:C], possible, scales, boosters, reach=reach, mode=mode).potentials(weights)
 
     plain: dict[str, Any] = {name: value.tolist() for name, value in scales.named_buffers()}
     arrays = source.numpy(), target.numpy(), MOTIONS[:C].numpy()
-    nothing = [], [], [], []
-    local = oracles.lattice_local(*arrays, reach[0].numpy(), plain, [0.0, 0.0, 0.0], nothing, nothing)
-    extension = oracles.lattice_extension(*arrays, reach[0].numpy(), plain, float(batch.range_noise))
-    assert (extension != 0).any((0, 1)).sum() >= 9
-    paper, others = weights[PAPER_WEIGHTS].numpy(), weights[[k for k in range(43) if k not in PAPER_WEIGHTS]].numpy()
+    nothing, there = ([], [], [], []), possible[0, :, :C].numpy()
+    local = oracles.lattice_local(*arrays, there, plain, [0.0, 0.0, 0.0], nothing, nothing)
+    feature = reach[0].numpy() * (mode == "soft")
+    extension = oracles.lattice_extension(*arrays, there, plain, float(batch.range_noise), feature)
+    assert (extension != 0).any((0, 1)).sum() >= 9 + (mode == "soft")
+    paper, others = weights[PAPER_WEIGHTS].numpy(), weights[[k for k in range(44) if k not in PAPER_WEIGHTS]].numpy()
     unary = local @ paper + extension @ others
-    unary.reshape(N, M + 1, C + 1)[:, :, :C][~reach[0].numpy()[:, None].repeat(M + 1, 1)] = -np.inf
+    unary.reshape(N, M + 1, C + 1)[:, :, :C][~there[:, None].repeat(M + 1, 1)] = -np.inf
     pairwise = oracles.lattice_pairwise(*arrays, plain) @ paper
     for ours, theirs in zip(tables(found), (unary, pairwise), strict=True):
         assert_close(torch.from_numpy(ours), theirs)
 
     if M == 2:
         start = replace(make_start(batch, MOTIONS[:C]), reach=reach)
-        parameters = Parameters(*weights.split([23, 20]), scales, boosters)
-        answer = decode(batch, start, config(clusters=C + 1, candidates=0, iterations=1), parameters)
+        parameters = Parameters(*weights.split([23, 21]), scales, boosters)
+        answer = decode(batch, start, config(clusters=C + 1, candidates=0, iterations=1), parameters, mode)
         j, k = np.divmod(np.array(oracles.best_labelling(unary, pairwise)), C + 1)
         assert answer.association[0].tolist() == np.where(j == M, -1, j).tolist()
         assert answer.cluster[0].tolist() == np.where(k == C, -1, k).tolist()
@@ -331,7 +340,7 @@ def test_a_super_node_has_the_extensions_of_both_chains_given_the_others_state(c
         at = clustering.correspond(batch.source, batch.target, motions, found.nearest, association)
         expected = clustering_unary(view, at, motions, active, scales)[..., 4:]
         assert_close(moving[:, :, j, :, 11:][real[..., j]], expected[real[..., j]])
-    assert moving.shape[-1] == 19
+    assert moving.shape[-1] == 20
     assert (moving[real][..., 2:7] != 0).flatten(0, -2).any(0).all()
 
 
@@ -367,10 +376,14 @@ def config(**inference: object) -> ModelConfig:
 
 
 def decode(
-    batch: ScanPairBatch, start: Start, settings: ModelConfig | None = None, parameters: Parameters | None = None
+    batch: ScanPairBatch,
+    start: Start,
+    settings: ModelConfig | None = None,
+    parameters: Parameters | None = None,
+    reach: str = "hard",
 ) -> Prediction:
     with torch.no_grad():
-        return sweep.decode(PairView.of(batch), start, parameters or WEIGHTS, settings or config())
+        return sweep.decode(PairView.of(batch, reach=reach), start, parameters or WEIGHTS, settings or config())
 
 
 def test_a_clean_scene_is_solved() -> None:
@@ -400,8 +413,8 @@ def test_the_order_of_the_movers_does_not_matter(settings: dict[str, object]) ->
 
 def test_clusters_that_are_ruled_out_are_never_visited() -> None:
     batch, _ = scene(24)
-    reach = torch.ones(1, 24, 3, dtype=torch.bool)
-    reach[0, :, 2] = False
+    reach = torch.zeros(1, 24, 3, dtype=torch.float64)
+    reach[0, :, 2] = 0.1
     active = torch.tensor([True, False, True])
     start = replace(make_start(batch, MOTIONS, active=active), reach=reach)
     for temperature in (0.0, 1.0):

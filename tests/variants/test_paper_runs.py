@@ -9,6 +9,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.inference.start import FARTHEST
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.variants.paper_start import EXPLAINED, FEWEST, movers_from_associations, run_motions
 
@@ -38,36 +39,39 @@ def row(n: int, x: float = 0.0) -> Tensor:
 def test_every_run_has_its_motion_the_largest_first() -> None:
     source = torch.cat([row(5), row(8, 20.0)])
     partner = torch.cat([se2.apply(TRUE[1], source[:5]), se2.apply(TRUE[2], source[5:])])
-    assert_close(run_motions(source, partner, torch.arange(13)), TRUE[[2, 1]])
+    assert_close(run_motions(source, partner, torch.arange(13))[0], TRUE[[2, 1]])
 
 
 def test_a_gap_in_number_ends_a_run() -> None:
     source = row(10)
     partner = torch.cat([se2.apply(TRUE[1], source[:4]), se2.apply(TRUE[2], source[4:])])
     joined, parted = torch.arange(10), torch.arange(10) + 4 * (torch.arange(10) >= 4)
-    assert_close(run_motions(source, partner, parted), TRUE[[2, 1]])
-    assert run_motions(source, partner, joined).shape == (1, 3)
+    assert_close(run_motions(source, partner, parted)[0], TRUE[[2, 1]])
+    assert run_motions(source, partner, joined)[0].shape == (1, 3)
     barely = torch.arange(10) + 2 * (torch.arange(10) >= 4)  # a step of three is no gap
-    assert run_motions(source, partner, barely).shape == (1, 3)
+    assert run_motions(source, partner, barely)[0].shape == (1, 3)
 
 
 def test_runs_that_move_alike_are_one() -> None:
     source = torch.cat([row(6), row(5, 10.0), row(4, 20.0)])
     partner = torch.cat([se2.apply(TRUE[1], source[:11]), se2.apply(TRUE[2], source[11:])])
-    assert_close(run_motions(source, partner, torch.arange(15)), TRUE[[1, 2]])
+    motions, runs = run_motions(source, partner, torch.arange(15))
+    assert_close(motions, TRUE[[1, 2]])
+    assert [row.nonzero()[:, 0].tolist() for row in runs] == [list(range(6)), list(range(11, 15))]
     assert EXPLAINED < 1
 
 
 @pytest.mark.parametrize("n", range(FEWEST + 1))
 def test_short_runs_say_nothing(n: int) -> None:
     source = row(n)
-    found = run_motions(source, se2.apply(TRUE[1], source), torch.arange(n))
-    assert found.shape == ((1, 3) if n >= FEWEST else (0, 3))
+    motions, runs = run_motions(source, se2.apply(TRUE[1], source), torch.arange(n))
+    assert motions.shape == ((1, 3) if n >= FEWEST else (0, 3))
+    assert runs.shape == (len(motions), n)
 
 
 def test_many_short_runs_say_nothing() -> None:
     source = torch.cat([row(3, 10.0 * k) for k in range(5)])
-    assert run_motions(source, source + 1, torch.arange(15)).shape == (0, 3)
+    assert run_motions(source, source + 1, torch.arange(15))[0].shape == (0, 3)
 
 
 def test_movers_from_associations() -> None:
@@ -84,6 +88,9 @@ def test_movers_from_associations() -> None:
         assert torch.equal(start.association, association)
         if movers:
             assert_close(start.motions[0, 1], torch.tensor([0.0, 2.0, 0.0]).double())
+            assert (start.reach[0, 20:, 1] == 0).all()
+            assert (start.reach[0, :15, 1] == FARTHEST).all()
+            assert (start.reach[..., 0] == 0).all()
 
 
 def test_the_papers_start_needs_no_more_than_a_model() -> None:

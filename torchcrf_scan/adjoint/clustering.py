@@ -22,6 +22,7 @@ GATE, OUTLIER_BIAS = (CLUSTERING_WEIGHTS.index(name) for name in CLUSTERING_DECI
 SEEN_THROUGH, SEEN_THROUGH_BACK, HIDDEN, HIDDEN_BACK, OUTLIER_SEEN_THROUGH, OUTLIER_HIDDEN = (
     CLUSTERING_WEIGHTS.index(name) for name in CLUSTERING_FREE_SPACE
 )
+REACH = CLUSTERING_WEIGHTS.index("reach")
 SEQUENCE, WEIGHT_SAME, WEIGHT_DIFFERENT, STIFFNESS_SAME, STIFFNESS_DIFFERENT, DISTANCE_SAME, DISTANCE_DIFFERENT, SWITCH = (
     CLUSTERING_WEIGHTS.index(name) for name in CLUSTERING_EDGE
 )
@@ -55,6 +56,7 @@ def pull_residual(
         beyond = 1 / (1 + math.exp(-(residual / model.gate - 1) / GATE_WIDTH))
         weights[DISTANCE] += slopes[i] * robust_square(residual, 1 / model.cluster_distance)
         weights[GATE] -= slopes[i] * beyond
+        weights[REACH] += slopes[i] * robust_square(scene.reach[i, c], 1.0)
         weights[INLIER_IN] += slopes[i] if state.association[i] >= 0 else 0.0
         slope = w.cluster_distance * robust_slope(residual, 1 / model.cluster_distance)
         slope -= w.gate * beyond * (1 - beyond) / (model.gate * GATE_WIDTH)

@@ -28,7 +28,7 @@ class Side:
 
     Attributes:
         points: (B, P, 2), mask: (B, P), sweep: of the scan. other, other_sweep: (B, Q, 2) points and sweep of the other scan.
-        motions: (B, C, 3). log_odds: (B, C) of the existence of each mover. reach: (B, P, C); None: within `NEAR` units of it.
+        motions: (B, C, 3). log_odds: (B, C) of the existence of each mover. reach: (B, P, C) of `Start`; None: by distance, `NEAR`.
     """
 
     points: Tensor
@@ -138,7 +138,7 @@ def best_mover(side: Side, distance: Tensor) -> tuple[Tensor, Tensor]:
     distance: (B, C, P) units under every motion.
     """
     distance = distance[:, 1:]
-    reach = distance < NEAR if side.reach is None else side.reach[..., 1:].mT
+    reach = distance < NEAR if side.reach is None else side.reach[..., 1:].mT <= 0
     there = reach & (side.log_odds[:, 1:, None] > -torch.inf)
     sure = torch.sigmoid(side.log_odds[:, 1:, None]) * torch.exp(-distance / 2) * there
     none = distance.new_zeros(distance.shape[0], 1, distance.shape[2])

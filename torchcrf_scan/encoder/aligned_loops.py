@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcrf_scan.encoder.channels import BESIDE, CHANNELS, FARTHEST, LARGEST_TURN, LONGEST_CHORD, NEAR, NOWHERE, PROFILE, WINDOW
 from torchcrf_scan.fast.free_space import Sweep, beam_after, look, sweep_of
 from torchcrf_scan.loops.circle import turn_between
-from torchcrf_scan.loops.jit import Array, Booleans, entry, kernel
+from torchcrf_scan.loops.jit import Array, entry, kernel
 from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.pair import Pair, PairStart, padded
 from torchcrf_scan.loops.rigid import inverse, transform, transform_of
@@ -102,11 +102,12 @@ def fill_cross(sweep: Sweep, points: Array, x: float, y: float, unit: float, cha
 
 @kernel
 def channels_of(
-    points: Array, sweep: Sweep, other: Array, other_sweep: Sweep, motions: Array, log_odds: Array, reach: Booleans
+    points: Array, sweep: Sweep, other: Array, other_sweep: Sweep, motions: Array, log_odds: Array, reach: Array
 ) -> Array:
     """(P, F) the channels of one scan's points.
 
-    points: (P, 2), other: (Q, 2). motions: (C, 3) into the other's frame. log_odds: (C,). reach: (P, C), or (0, C): by distance.
+    points: (P, 2), other: (Q, 2). motions: (C, 3) into the other's frame. log_odds: (C,).
+    reach: (P, C) of `Start`, or (0, C): by distance.
     """
     P, C = len(points), len(motions)
     channels = np.zeros((P, WIDTH))
@@ -117,7 +118,7 @@ def channels_of(
         fill_own(sweep, i, unit, usual, channels[i])
         background, best, sure = FARTHEST, FARTHEST, 0.0
         for c in range(C):
-            is_there = log_odds[c] > -np.inf and (c == 0 or len(reach) == 0 or reach[i, c])
+            is_there = log_odds[c] > -np.inf and (c == 0 or len(reach) == 0 or reach[i, c] <= 0)
             if c > 0 and not is_there:
                 continue
             x, y = transform(transforms[c], points[i, 0], points[i, 1])
@@ -137,7 +138,7 @@ def channels_of(
 
 
 @entry
-def channels_of_side(pair: Pair, motions: Array, log_odds: Array, reach: Booleans, is_target: bool) -> Array:
+def channels_of_side(pair: Pair, motions: Array, log_odds: Array, reach: Array, is_target: bool) -> Array:
     """(N, F) of the source, or (M, F) of the target. motions: (C, 3); log_odds: (C,); reach: (N, C)."""
     source = sweep_of(pair.source, pair.noise, pair.source_closed, np.zeros(2))
     target = sweep_of(pair.target, pair.noise, pair.target_closed, pair.target_origin)

@@ -110,5 +110,6 @@ def features_key(study: Study, train: Sequence[int], config: RunConfig) -> str:
         learning.pop(name)
     features["left_out"] = [name for name in features["left_out"] if name.removeprefix("association.") in LOCAL_CHANNELS]
     features.pop("raw_channels")
+    features.pop("reach")
     states = [inference[name] for name in ("clusters", "candidates", "candidate_search")]
     return json.dumps([study.collection.names, list(train), learning, features, states])

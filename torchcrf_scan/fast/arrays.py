@@ -50,6 +50,7 @@ class Settings(NamedTuple):
     translation_tolerance: float
     wrap_closed: bool
     is_metre: bool
+    is_reach_hard: bool
 
 
 class Decoded(NamedTuple):
@@ -82,7 +83,7 @@ class Scene(NamedTuple):
 
     Attributes:
         factor: units in a metre. source: (N, 2), target: (M, 2). noise: of a return.
-        tangents: (M, 2) of the target. reach: (N, C).
+        tangents: (M, 2) of the target. reach: (N, C) of `Start`; inf where `features.reach` hard rules a cluster out.
         outlier, moving: (N,) log potentials of `features.learned.ExtraLogUnary`.
     """
 
@@ -95,7 +96,7 @@ class Scene(NamedTuple):
     target_sweep: Sweep
     descriptors: AssociationPair
     tangents: Array
-    reach: Booleans
+    reach: Array
     outlier: Array
     moving: Array
 
@@ -147,4 +148,5 @@ def settings_of(model: ModelConfig) -> Settings:
         config.translation_tolerance,
         features.wrap_closed,
         features.length_unit == "metre",
+        features.reach == "hard",
     )

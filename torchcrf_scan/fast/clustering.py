@@ -39,6 +39,7 @@ class ClusteringWeights(NamedTuple):
     hidden_back: float
     outlier_seen_through: float
     outlier_hidden: float
+    reach: float
     sequence: float
     neighbour_weight_same: float
     neighbour_weight_different: float
@@ -162,17 +163,19 @@ def fill_residual(
 
 @kernel
 def fill_agreement(
-    moved: Array, residual: Array, association: Integers, reach: Booleans, c: int, model: ClusteringModel, log_inlier: Array
+    moved: Array, residual: Array, association: Integers, reach: Array, c: int, model: ClusteringModel, log_inlier: Array
 ) -> None:
-    """Writes the potentials (N,) of cluster c without free-space tests, -inf beyond its reach. See `tabulate` for the arguments."""
+    """Writes the potentials (N,) of cluster c without free-space tests, -inf where ruled out. See `tabulate` for the arguments."""
     w = model.weights
     for i in range(len(moved)):
-        if not reach[i, c]:
+        if reach[i, c] == np.inf:
             log_inlier[i] = -np.inf
             continue
         total = w.cluster_distance * robust_square(residual[i], 1 / model.cluster_distance)
         if w.gate != 0:
             total -= w.gate / (1 + math.exp(-(residual[i] / model.gate - 1) / GATE_WIDTH))
+        if w.reach != 0:
+            total += w.reach * robust_square(reach[i, c], 1.0)
         log_inlier[i] = total + (w.cluster_inlier_in if association[i] >= 0 else 0.0)
 
 
@@ -219,7 +222,7 @@ def tabulate(
     target_sweep: Sweep,
     motions: Array,
     active: Booleans,
-    reach: Booleans,
+    reach: Array,
     association: Integers,
     nearest_target: Integers,
     model: ClusteringModel,
@@ -229,7 +232,7 @@ def tabulate(
     Args:
         source: (N, 2); target: (M, 2), and their sweeps.
         motions: (C, 3). active: (C,) clusters that exist, the background among them.
-        reach: (N, C) clusters within reach of a point.
+        reach: (N, C) as in `fast.arrays.Scene`.
         association: (N,), -1 outlier. nearest_target: (N, C) nearest target point, of outliers at least.
     """
     N, C = len(source), len(motions)

@@ -45,6 +45,17 @@ def scaled_motions(motions: Array, factor: float) -> Array:
     return scaled
 
 
+@kernel
+def limited(reach: Array) -> Array:
+    """(N, C) of `Start.reach`, inf where it is not 0."""
+    found = np.zeros_like(reach)
+    for i in range(reach.shape[0]):
+        for c in range(reach.shape[1]):
+            if reach[i, c] > 0:
+                found[i, c] = np.inf
+    return found
+
+
 @entry
 def scene_of(pair: Pair, start: PairStart, outlier: Array, moving: Array, settings: Settings) -> Scene:
     """The pair in the unit of the features, with its descriptors. outlier, moving: (N,) as in `Scene`."""
@@ -59,7 +70,8 @@ def scene_of(pair: Pair, start: PairStart, outlier: Array, moving: Array, settin
     source_sweep = sweep_of(source, noise, source_closed, np.zeros(2))
     target_sweep = sweep_of(target, noise, target_closed, origin)
     boxes = boxes_of(target)
-    given = start.target_tangents, start.reach, outlier, moving
+    reach = limited(start.reach) if settings.is_reach_hard else start.reach
+    given = start.target_tangents, reach, outlier, moving
     return Scene(factor, source, target, noise, boxes, source_sweep, target_sweep, descriptors, *given)
 
 

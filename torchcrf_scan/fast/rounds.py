@@ -66,13 +66,13 @@ def tables_of(scene: Scene, state: State, model: ClusteringModel) -> Tables:
 
 
 @kernel
-def nearest_clusters(tables: Tables, reach: Booleans, association: Integers) -> Integers:
-    """(N,) cluster within reach (N, C) whose motion takes a point nearest to its partner; -1 without a partner."""
+def nearest_clusters(tables: Tables, reach: Array, association: Integers) -> Integers:
+    """(N,) cluster of finite reach (N, C) whose motion takes a point nearest to its partner; -1 without a partner."""
     labels = np.empty(len(association), np.int64)
     for i in range(len(labels)):
         least, best = np.inf, 0
         for c in range(len(tables.residual)):
-            if reach[i, c] and tables.residual[c, i] < least:
+            if reach[i, c] < np.inf and tables.residual[c, i] < least:
                 least, best = tables.residual[c, i], c
         labels[i] = best if association[i] >= 0 else -1
     return labels

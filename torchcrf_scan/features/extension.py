@@ -1,7 +1,8 @@
-"""Features in addition to the paper's thirty (`features.decisions`, `features.free_space`), for the inlier/outlier decision.
+"""Features in addition to the paper's thirty: `features.decisions`, `features.free_space`, `features.reach`.
 
 Robust squares do not set a distance limit for inliers, so there are a gate and a constant; nor do they prefer the nearest of
-several points enough. And a point in the free space of the other scan under a motion does not move so (design finding 13).
+several points enough. A point in the free space of the other scan under a motion does not move so (design finding 13), and a
+point far from the segment that a mover was found by is hardly part of it (finding 21).
 Names and order are those of `names.py`.
 """
 
@@ -12,13 +13,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchcrf_scan.features.free_space import FreeSpace
-from torchcrf_scan.features.scales import Scales, beyond_gate
-from torchcrf_scan.names import CLUSTERING_DECISIONS, CLUSTERING_FREE_SPACE
+from torchcrf_scan.features.scales import Scales, beyond_gate, robust_square
+from torchcrf_scan.names import CLUSTERING_EXTENSION
 
 FARTHEST_EXCESS = 3.0  # scales
-_OF_OUTLIER = [name for name in (*CLUSTERING_DECISIONS, *CLUSTERING_FREE_SPACE) if name.startswith("outlier")]
-_OF_INLIERS = [name for name in (*CLUSTERING_DECISIONS, *CLUSTERING_FREE_SPACE) if name not in _OF_OUTLIER]
-ORDER = [[*_OF_INLIERS, *_OF_OUTLIER].index(name) for name in (*CLUSTERING_DECISIONS, *CLUSTERING_FREE_SPACE)]
+_OF_OUTLIER = [name for name in CLUSTERING_EXTENSION if name.startswith("outlier")]
+_OF_INLIERS = [name for name in CLUSTERING_EXTENSION if name not in _OF_OUTLIER]
+ORDER = [[*_OF_INLIERS, *_OF_OUTLIER].index(name) for name in CLUSTERING_EXTENSION]
 
 
 def association_extension(distance: Tensor, mask: Tensor, sight: FreeSpace, scales: Scales) -> Tensor:
@@ -38,7 +39,9 @@ def association_extension(distance: Tensor, mask: Tensor, sight: FreeSpace, scal
     return with_outlier(inliers, outlier)
 
 
-def clustering_extension(residual: Tensor, ahead: FreeSpace, back: FreeSpace, is_inlier: Tensor, scales: Scales) -> Tensor:
+def clustering_extension(
+    residual: Tensor, ahead: FreeSpace, back: FreeSpace, is_inlier: Tensor, reach: Tensor | None, scales: Scales
+) -> Tensor:
     """The clustering chain's extension features of every state, the outlier last.
 
     Args:
@@ -46,13 +49,15 @@ def clustering_extension(residual: Tensor, ahead: FreeSpace, back: FreeSpace, is
         ahead: free space and occlusion in the target scan of the points under every motion, (B, N, C).
         back: the same in the source scan of the points' partners under every motion's inverse, (B, N, C); inliers only.
         is_inlier: (B, N) whether the point has a partner.
+        reach: (B, N, C) of `Start.reach`; None: a feature of zeros.
 
     Returns:
-        (B, N, D, 8).
+        (B, N, D, 9).
     """
     partnered = is_inlier[..., None].to(residual)
     contradicted = [ahead.seen_through, back.seen_through * partnered, ahead.hidden, back.hidden * partnered]
-    inliers = -torch.stack([beyond_gate(residual, scales), *contradicted], dim=-1)
+    beyond = torch.zeros_like(residual) if reach is None else -robust_square(reach, torch.ones_like(reach))
+    inliers = -torch.stack([beyond_gate(residual, scales), *contradicted, beyond], dim=-1)
     under_background = [ahead.seen_through[..., 0], ahead.hidden[..., 0]]
     outlier = torch.stack([torch.ones_like(under_background[0]), *under_background], dim=-1)
     return with_outlier(inliers, outlier)[..., ORDER]

@@ -56,6 +56,7 @@ class PairView:
         factor: (B,) that unit's factor on metres.
         source_sweep, target_sweep: the scans in polar coordinates about their sensors.
         learned: embeddings and extra log potentials; None: none.
+        reach: as in `FeatureConfig`.
     """
 
     batch: ScanPairBatch
@@ -65,16 +66,23 @@ class PairView:
     source_sweep: Sweep
     target_sweep: Sweep
     learned: LearnedInputs | None = None
+    reach: str = "hard"
 
     @classmethod
     def of(
-        cls, batch: ScanPairBatch, wrap_closed: bool = True, length_unit: str = "metre", learned: LearnedInputs | None = None
+        cls,
+        batch: ScanPairBatch,
+        wrap_closed: bool = True,
+        length_unit: str = "metre",
+        learned: LearnedInputs | None = None,
+        reach: str = "hard",
     ) -> PairView:
         """Computes the descriptors of both scans.
 
         Args:
             wrap_closed: neighbours wrap on a closed scan (A-06); off, they clamp as in the paper.
             length_unit: `metre`, or `spacing`: lengths relative to the resolution of the pair's scans.
+            learned, reach: see above.
         """
         factor = torch.ones_like(batch.dt) if length_unit == "metre" else REFERENCE_UNIT / resolution(batch)
         batch = batch.scaled(factor)
@@ -89,7 +97,12 @@ class PairView:
             Sweep.of(batch.source, batch.source_mask, source_closed, batch.range_noise, here),
             Sweep.of(batch.target, batch.target_mask, target_closed, batch.range_noise, batch.target_origin),
             learned,
+            reach,
         )
+
+    def within(self, reach: Tensor | None) -> Tensor | None:
+        """(B, N, C) clusters that a point may be in, from `Start.reach`; None: all, unless `reach` is `hard`."""
+        return reach <= 0 if reach is not None and self.reach == "hard" else None
 
     def in_unit(self, given: Given) -> Given:
         """A start, or motions (B, ..., 3), from metres to the features' unit of length."""
@@ -240,25 +253,33 @@ def association_potentials(
     return log_unary, (pairwise @ weights[ASSOCIATION_UNARY:]).to(pairwise)
 
 
-def clustering_unary(view: PairView, at: clustering.Correspondence, motions: Tensor, active: Tensor, scales: Scales) -> Tensor:
+def clustering_unary(
+    view: PairView, at: clustering.Correspondence, motions: Tensor, active: Tensor, scales: Scales, reach: Tensor | None = None
+) -> Tensor:
     """Features of every cluster, the outlier last: C1..C4 (spec 4.1) and the extensions.
 
-    at: the source points under the motions (B, C, 3), of which `active` (B, C) exist. Returns (B, N, D, 12).
+    at: the source points under the motions (B, C, 3), of which `active` (B, C) exist. reach: as in `contradictions`. Returns
+    (B, N, D, 13).
     """
-    return torch.cat([clustering.local_features(at, active, scales), contradictions(view, at, motions, scales)], dim=-1)
+    return torch.cat([clustering.local_features(at, active, scales), contradictions(view, at, motions, scales, reach)], dim=-1)
 
 
-def contradictions(view: PairView, at: clustering.Correspondence, motions: Tensor, scales: Scales) -> Tensor:
-    """(B, N, D, 8) the clustering chain's extensions, which do not depend on the set of active clusters."""
+def contradictions(
+    view: PairView, at: clustering.Correspondence, motions: Tensor, scales: Scales, reach: Tensor | None = None
+) -> Tensor:
+    """(B, N, D, 9) the clustering chain's extensions, which do not depend on the set of active clusters.
+
+    reach: (B, N, C) of `Start.reach`, a feature if the view's `reach` is `soft`; None: all points are within reach.
+    """
     carried_back = se2.apply(se2.inverse(motions), at.partner[:, None]).transpose(1, 2)  # (B, N, C, 2)
     sight = look(view.target_sweep, at.moved), look(view.source_sweep, carried_back)
-    return clustering_extension(at.residual, *sight, at.is_inlier, scales)
+    return clustering_extension(at.residual, *sight, at.is_inlier, reach if view.reach == "soft" else None, scales)
 
 
 def possible_clusters(active: Tensor, reach: Tensor | None, points: int) -> Tensor:
     """(B, N, D) states of the clustering chain that are not ruled out; the outlier never is.
 
-    active: (B, C). reach: (B, N, C) clusters within reach of a point, None: all. points: N.
+    active: (B, C). reach: (B, N, C) bool, clusters within reach of a point, None: all. points: N.
     """
     inliers = active[:, None].expand(-1, points, -1)
     if reach is not None:
@@ -272,7 +293,7 @@ def clustering_potentials(
     """Log potentials (B, N, D) and (B, N-1, D, D) of the clustering chain (spec 7.5: inactive clusters are impossible).
 
     Args:
-        local: (B, N, D, 12). pairwise: (B, N-1, D, D, 8). possible: (B, N, D) bool. weights: (20,).
+        local: (B, N, D, 13). pairwise: (B, N-1, D, D, 8). possible: (B, N, D) bool. weights: (21,).
         extra: (B, N, D) learned log potentials to add; None: none.
     """
     log_unary = (local @ weights[:CLUSTERING_UNARY]).to(local)

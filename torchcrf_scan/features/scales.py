@@ -12,6 +12,7 @@ from torchcrf_scan.names import (
     DECISION_WEIGHTS,
     FREE_SPACE_WEIGHTS,
     LOCAL_CHANNELS,
+    REACH_WEIGHT,
     SCALED_EDGES,
 )
 
@@ -29,11 +30,12 @@ WORST = -4.0  # value of a channel at the outlier state before any fitting
 
 
 def live_weights(config: FeatureConfig) -> tuple[Tensor, Tensor]:
-    """(23,) and (20,): 1 for the weights of the model, 0 for those fixed at 0 (raw channels in W-B, left-out features)."""
+    """(23,) and (21,): 1 for the weights of the model, 0 for those fixed at 0 (raw channels in W-B, left-out features)."""
     dead = {*config.left_out}
     dead |= set() if config.raw_channels else {f"association.{name}" for name in LOCAL_CHANNELS}
     dead |= set() if config.free_space else {*FREE_SPACE_WEIGHTS}
     dead |= set() if config.decisions else {*DECISION_WEIGHTS}
+    dead |= set() if config.reach == "soft" else {REACH_WEIGHT}
     association = [f"association.{name}" not in dead for name in ASSOCIATION_WEIGHTS]
     clustering = [f"clustering.{name}" not in dead for name in CLUSTERING_WEIGHTS]
     return torch.tensor(association, dtype=torch.float64), torch.tensor(clustering, dtype=torch.float64)
@@ -41,7 +43,8 @@ def live_weights(config: FeatureConfig) -> tuple[Tensor, Tensor]:
 
 def has_weight(config: FeatureConfig, name: str) -> bool:
     """Whether a model has the parameter `association.NAME` or `clustering.NAME`: the paper's 30 always, extensions if enabled."""
-    return (config.free_space or name not in FREE_SPACE_WEIGHTS) and (config.decisions or name not in DECISION_WEIGHTS)
+    is_on = (config.free_space or name not in FREE_SPACE_WEIGHTS) and (config.decisions or name not in DECISION_WEIGHTS)
+    return is_on and (config.reach == "soft" or name != REACH_WEIGHT)
 
 
 def robust_square(error: Tensor, scale: Tensor) -> Tensor:

@@ -122,7 +122,7 @@ def first_state(view: PairView, start: Start, parameters: Parameters, config: In
     batch = view.batch
     found = find_candidates(view, start.motions, start.active, config)
     at = clustering.correspond(batch.source, batch.target, start.motions, found.nearest, start.association)
-    possible = possible_clusters(start.active, start.reach, batch.source.shape[1])
+    possible = possible_clusters(start.active, view.within(start.reach), batch.source.shape[1])
     best = at.residual.masked_fill(~possible[..., :-1], torch.inf).argmin(-1)
     index, mask, place = with_targets(found.index, found.mask, start.association)
     outlier = start.association < 0
@@ -185,9 +185,9 @@ def update_clusters(
     """An exact pass over the clustering chain at fixed motions and associations."""
     batch, scales = view.batch, parameters.scales
     at = clustering.correspond(batch.source, batch.target, state.motions.value, found.nearest, state.association)
-    local = clustering_unary(view, at, state.motions.value, state.motions.active, scales)
+    local = clustering_unary(view, at, state.motions.value, state.motions.active, scales, start.reach)
     pairwise = clustering.pairwise_features(batch.source, at, scales)
-    possible = possible_clusters(state.motions.active, start.reach, batch.source.shape[1])
+    possible = possible_clusters(state.motions.active, view.within(start.reach), batch.source.shape[1])
     extra = clustering_extra(view.learned, possible.shape[-1])
     potentials = clustering_potentials(local, pairwise, possible, parameters.clustering, extra)
     log_cluster = chain_beliefs(*potentials, batch.source_mask, config.temperature, in_loops=config.backend != "eager")

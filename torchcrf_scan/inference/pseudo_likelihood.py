@@ -46,7 +46,7 @@ class PlugIns:
         cluster: (B, N) hat x_c in the registered channel, -1 outlier (moved with the background).
         label: (B, N) true cluster as a slot of `motions`, -1 outlier.
         known: (B, N) bool, annotated nodes.
-        reach: (B, N, C) clusters within reach of a point; None: all.
+        reach: (B, N, C) as in `Start`; None: 0 everywhere.
     """
 
     motions: Tensor
@@ -181,21 +181,21 @@ def association_design(view: PairView, plugins: PlugIns, scales: Scales, booster
 
 
 def clustering_chain(view: PairView, plugins: PlugIns, scales: Scales) -> Chain:
-    """The clustering chain's 12 + 8 features."""
+    """The clustering chain's 13 + 8 features."""
     batch = view.batch
     C = plugins.motions.shape[1]
     found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, 1)
     at = clustering.correspond(batch.source, batch.target, plugins.motions, found.nearest, plugins.association)
-    local = clustering_unary(view, at, plugins.motions, plugins.active, scales)
+    local = clustering_unary(view, at, plugins.motions, plugins.active, scales, plugins.reach)
     pairwise = clustering.pairwise_features(batch.source, at, scales)
     label = torch.where(plugins.label >= 0, plugins.label, C)
     known = plugins.known & batch.source_mask
-    possible = possible_clusters(plugins.active, plugins.reach, label.shape[1])
+    possible = possible_clusters(plugins.active, view.within(plugins.reach), label.shape[1])
     return Chain(local, pairwise, possible, label, known, clustering_extra(view.learned, C + 1))
 
 
 def clustering_design(view: PairView, plugins: PlugIns, scales: Scales) -> Design:
-    """The clustering chain's 20 features of every state at the true labels of its neighbours."""
+    """The clustering chain's 21 features of every state at the true labels of its neighbours."""
     return clustering_chain(view, plugins, scales).design()
 
 

@@ -58,7 +58,7 @@ class ConsideredChain:
 
     Attributes:
         view, start, parameters: as in `joint.decode`.
-        at: moved points and their residuals. beside_local: (B, N, D, 8) features that do not depend on the set of clusters.
+        at: moved points and their residuals. beside_local: (B, N, D, 9) features that do not depend on the set of clusters.
         pairwise: (B, N-1, D, D, 8). in_loops: totals are computed by the loops where they can read tensors.
     """
 
@@ -77,7 +77,7 @@ class ConsideredChain:
         found = find_candidates(view, motions.value, motions.active, config)
         at = clustering.correspond(batch.source, batch.target, motions.value, found.nearest, state.association)
         pairwise = clustering.pairwise_features(batch.source, at, scales)
-        beside = contradictions(view, at, motions.value, scales)
+        beside = contradictions(view, at, motions.value, scales, start.reach)
         return cls(view, start, parameters, at, beside, pairwise, config.backend != "eager")
 
     def evidence(self, active: Tensor) -> Tensor:
@@ -90,7 +90,8 @@ class ConsideredChain:
         mask = self.view.batch.source_mask
         B, C = active.shape
         local = torch.cat([clustering.local_features(self.at, active, self.parameters.scales), self.beside_local], dim=-1)
-        possible = possible_clusters(active, self.start.reach, mask.shape[1])  # (B, N, D)
+        within = self.view.within(self.start.reach)
+        possible = possible_clusters(active, within, mask.shape[1])  # (B, N, D)
         extra = clustering_extra(self.view.learned, C + 1)
         every = torch.ones_like(possible)
         log_unary, log_pairwise = clustering_potentials(local, self.pairwise, every, self.parameters.clustering, extra)
@@ -102,7 +103,7 @@ class ConsideredChain:
         is_other = ~torch.eye(C, dtype=torch.bool, device=active.device)
         is_other = torch.cat([torch.ones_like(is_other[:1]), is_other[1:]])  # row 0: all clusters; row k: without cluster k
         there = active & is_other[:, None]  # (C, B, C)
-        possible = torch.stack([possible_clusters(row, self.start.reach, mask.shape[1]) for row in there])  # (C, B, N, D)
+        possible = torch.stack([possible_clusters(row, within, mask.shape[1]) for row in there])  # (C, B, N, D)
         totals = log_partition(
             *silence_padding(
                 log_unary.masked_fill(~possible, -torch.inf).flatten(0, 1),

@@ -20,6 +20,10 @@ REACH_EXTENT = 0.5  # of an object's visible extent, and
 
 REACH_UNITS = 4.0  # units of resolution beyond it may still belong to the object
 
+FARTHEST = 3.0  # reaches; points farther away count as so far, the cap of a robust square
+
+SHORTEST = 1e-9  # metres; least reach
+
 FOOTPRINT = 0.0175  # radians; point spacing of a one-degree scanner on a surface that faces it
 
 
@@ -32,7 +36,8 @@ class Start:
         motions: (B, C, 3), active: (B, C).
         association: (B, N) nearest target point under the best motion, -1 if none is within the gate.
         target_tangents: (B, M, 2) direction of the target's surface at every point, 0 where undefined.
-        reach: (B, N, C) bool, points near enough to the segment from which a mover was hypothesised to belong to it. None: all.
+        reach: (B, N, C) distance of every point from the segment by which a mover was found, see `beyond_reach`: 0 where the point
+            may well belong to it, up to `FARTHEST`. Used as `FeatureConfig.reach` says. None: 0 everywhere.
         log_odds: (B, C) score of every mover, including those that the score alone would reject (and that are not `active`);
             -inf for empty slots, inf for the background. None: `active` is final.
     """
@@ -67,32 +72,36 @@ class Start:
         return replace(self, motions=scale_motions(self.motions, factor))
 
 
-def within_reach(points: Tensor, members: Tensor, unit: Tensor) -> Tensor:
-    """Points that may belong to an object, given some of its points: within half its extent plus a few units of them.
+def beyond_reach(points: Tensor, members: Tensor, unit: Tensor) -> Tensor:
+    """How far points are from an object, given some of its points, less the object's reach: half its extent and a few units.
+
+    Differentiable in the points, at fixed nearest members and away from the cap.
 
     Args:
         points: (B, N, 2). members: (B, C, N) known points of every cluster. unit: (B,) metres.
 
     Returns:
-        (B, N, C); everything is in reach of the background.
+        (B, N, C) in reaches, from 0 to `FARTHEST`; 0 for the background.
     """
     spread = points[:, None].masked_fill(~members[..., None], torch.nan)  # (B, C, N, 2)
     low = spread.nan_to_num(nan=torch.inf).amin(2)
     high = spread.nan_to_num(nan=-torch.inf).amax(2)
     extent = torch.linalg.vector_norm((high - low).clamp(min=0), dim=-1)  # (B, C)
-    nearest = torch.stack(
-        [squared_distances(points, points, members[:, c]).amin(-1) for c in range(members.shape[1])], dim=-1
-    ).sqrt()  # (B, N, C)
-    reach = nearest <= (REACH_EXTENT * extent + REACH_UNITS * unit[:, None])[:, None]
-    reach[..., 0] = True
-    return reach
+    reach = (REACH_EXTENT * extent + REACH_UNITS * unit[:, None]).clamp(min=SHORTEST)[:, None]  # (B, 1, C)
+    nearest = torch.stack([squared_distances(points, points, members[:, c]).amin(-1) for c in range(members.shape[1])], dim=-1)
+    nearest = nearest.maximum(reach.square()).minimum(((1 + FARTHEST) * reach).square())  # a root has no slope at 0
+    beyond = (nearest.sqrt() / reach - 1).clamp(min=0)
+    return torch.cat([torch.zeros_like(beyond[..., :1]), beyond[..., 1:]], dim=-1)
 
 
 def nearest_association(
     batch: ScanPairBatch, motions: Tensor, active: Tensor, reach: Tensor | None = None, gate: float = ASSOCIATION_GATE
 ) -> Tensor:
-    """(B, N) nearest target point under any possible motion, -1 beyond `gate` units of footprint and noise."""
-    possible = possible_clusters(active, reach, batch.source.shape[1])  # (B, N, D)
+    """(B, N) nearest target point under any motion within reach, -1 beyond `gate` units of footprint and noise.
+
+    reach: (B, N, C) of `Start.reach`, of which 0 alone is within; None: all.
+    """
+    possible = possible_clusters(active, None if reach is None else reach <= 0, batch.source.shape[1])  # (B, N, D)
     nearest = batch.source.new_full(batch.source.shape[:2], torch.inf)
     index = torch.zeros_like(nearest, dtype=torch.int64)
     for c in range(motions.shape[1]):

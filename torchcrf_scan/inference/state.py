@@ -46,7 +46,7 @@ class ClusterPotential(nn.Module):
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """Learned parameters: weights (23,) and (20,), scales, boosters, calibration, potential of a mover's cluster."""
+    """Learned parameters: weights (23,) and (21,), scales, boosters, calibration, potential of a mover's cluster."""
 
     association: Tensor
     clustering: Tensor

@@ -85,7 +85,7 @@ def load_weights(model: JointScanCRF, origin: str | JointScanCRF) -> None:
         ValueError: no such model, or one of other features.
     """
     saved = (origin if isinstance(origin, JointScanCRF) else JointScanCRF.from_pretrained(origin)).state_dict()
-    fresh = model.embedding_state | {name: value for name, value in model.state_dict().items() if name.startswith("encoder.")}
+    fresh = model.optional_state | {name: value for name, value in model.state_dict().items() if name.startswith("encoder.")}
     try:
         model.load_state_dict(fresh | saved)
     except RuntimeError as error:

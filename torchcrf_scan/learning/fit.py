@@ -175,7 +175,7 @@ def clustering_chain(
 
 @torch.no_grad()
 def set_weights(model: JointScanCRF, chain: str, values: Tensor) -> None:
-    """Writes (23,) or (20,) weights into the named parameters; those of left-out features are skipped."""
+    """Writes (23,) or (21,) weights into the named parameters; those of left-out features are skipped."""
     names, weights = {
         "association": (ASSOCIATION_WEIGHTS, model.association_weights),
         "clustering": (CLUSTERING_WEIGHTS, model.clustering_weights),

@@ -11,14 +11,15 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.features.potentials import resolution
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.pseudo_likelihood import PlugIns, true_plugins
-from torchcrf_scan.inference.start import Start, within_reach
+from torchcrf_scan.inference.start import Start, beyond_reach
 from torchcrf_scan.learning.settings import LearningConfig
 
 
 def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig, generator: torch.Generator) -> PlugIns:
     """True motions with noise for some pairs, InitialiseRT's for the others; spare slots hold its spurious movers (spec 2.5, 6.2).
 
-    A found motion replaces a true one if it moves that cluster's points nearly alike. Labels are the annotated ones.
+    A found motion replaces a true one if it moves that cluster's points nearly alike. Labels are the annotated ones, and reaches
+    those of the true points: with those of the found segments the fitted model finds fewer movers.
     """
     truth = true_plugins(batch, start.motions.shape[1])
     noise = torch.randn(truth.motions.shape, generator=generator, dtype=torch.float64).to(truth.motions)
@@ -65,9 +66,9 @@ def fill_spare_slots(plugins: PlugIns, batch: ScanPairBatch, start: Start, stand
 
 
 def reach_of_truth(plugins: PlugIns, batch: ScanPairBatch) -> Tensor:
-    """(B, N, C) points within reach of the true points of every cluster."""
+    """(B, N, C) `beyond_reach` of the true points of every cluster."""
     clusters = torch.arange(plugins.motions.shape[1], device=plugins.label.device)
-    return within_reach(batch.source, plugins.label[:, None] == clusters[:, None], resolution(batch))
+    return beyond_reach(batch.source, plugins.label[:, None] == clusters[:, None], resolution(batch))
 
 
 def mix_associations(plugins: PlugIns, predicted: Tensor, share: float, generator: torch.Generator) -> PlugIns:

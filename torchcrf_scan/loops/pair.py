@@ -49,7 +49,7 @@ class PairStart(NamedTuple):
     active: Booleans
     association: Integers
     target_tangents: Array
-    reach: Booleans
+    reach: Array
     log_odds: Array
 
 

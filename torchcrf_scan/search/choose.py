@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from torchcrf_scan.inference.start import ASSOCIATION_GATE, FOOTPRINT, REACH_EXTENT, REACH_UNITS
+from torchcrf_scan.inference.start import ASSOCIATION_GATE, FARTHEST, FOOTPRINT, REACH_EXTENT, REACH_UNITS, SHORTEST
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
 from torchcrf_scan.loops.nearest import box_distance
 from torchcrf_scan.loops.pair import PairStart
@@ -34,9 +34,9 @@ def choose_movers(
     source, target, tangent = leftover.source.grid.scan.points, leftover.target.grid, leftover.target.grid.scan.tangent
     noise, (start, index), group = leftover.source.grid.scan.noise, hypotheses.groups, hypotheses.group
     motions, active = np.empty((clusters, 3)), np.zeros(clusters, np.bool_)
-    log_odds, reach = np.full(clusters, -np.inf), np.zeros((len(source), clusters), np.bool_)
+    log_odds, reach = np.full(clusters, -np.inf), np.full((len(source), clusters), FARTHEST)
     motions[:] = guess
-    active[0], log_odds[0], reach[:, 0] = True, np.inf, True
+    active[0], log_odds[0], reach[:, 0] = True, np.inf, 0.0
     if min(len(source), len(tangent)) < FEWEST_POINTS:
         return PairStart(motions, active, _associate(source, target, motions, active, reach, noise), 0 * tangent, reach, log_odds)
     motions[0] = leftover.background
@@ -51,28 +51,35 @@ def choose_movers(
 
 
 @kernel
-def _reach(points: Array, members: Integers, unit: float, is_near: Booleans) -> None:
-    """Writes the points (N,) within reach of the members: half the extent of their object and a few units."""
+def _reach(points: Array, members: Integers, unit: float, beyond: Array) -> None:
+    """Writes how far the points are beyond the reach of the members, (N,) in reaches; `inference.start.beyond_reach`.
+
+    beyond: (N,) of `FARTHEST`.
+    """
     box = np.empty(4)
     box_round(points, members, box)
     wide, high = box[2] - box[0], box[3] - box[1]
-    reach = REACH_EXTENT * math.sqrt(wide * wide + high * high) + REACH_UNITS * unit
-    last = 0  # member that was near enough to the point before
+    reach = max(REACH_EXTENT * math.sqrt(wide * wide + high * high) + REACH_UNITS * unit, SHORTEST)
+    near, far = reach * reach, ((1 + FARTHEST) * reach) ** 2
+    last = 0  # member nearest to the point before
     for i in range(len(points)):
         x, y = points[i, 0], points[i, 1]
-        if box_distance(box, x, y) > reach * reach:
+        if box_distance(box, x, y) >= far:
             continue
+        least, first = far, last
         for k in range(len(members)):
-            j = members[(last + k) % len(members)]
-            dx, dy = points[j, 0] - x, points[j, 1] - y
-            if dx * dx + dy * dy <= reach * reach:
-                is_near[i], last = True, (last + k) % len(members)
-                break
+            place = (first + k) % len(members)
+            dx, dy = points[members[place], 0] - x, points[members[place], 1] - y
+            if dx * dx + dy * dy < least:
+                least, last = dx * dx + dy * dy, place
+                if least <= near:
+                    break
+        beyond[i] = 0.0 if least <= near else max(math.sqrt(least) / reach - 1, 1e-15)
 
 
 @kernel
-def _associate(source: Array, target: ScanGrid, motions: Array, active: Booleans, reach: Booleans, noise: float) -> Integers:
-    """(N,) nearest target point under any possible motion, -1 beyond a few units of footprint and noise."""
+def _associate(source: Array, target: ScanGrid, motions: Array, active: Booleans, reach: Array, noise: float) -> Integers:
+    """(N,) nearest target point under any motion within reach, -1 beyond a few units of footprint and noise."""
     N = len(source)
     association, least = np.full(N, -1, np.int64), np.empty(N)
     for i in range(N):
@@ -85,6 +92,6 @@ def _associate(source: Array, target: ScanGrid, motions: Array, active: Booleans
         apply_to_rows(motions[c], source, moved)
         locate(moved, target, squared, near)
         for i in range(N):
-            if reach[i, c] and squared[i] < least[i]:
+            if reach[i, c] <= 0 and squared[i] < least[i]:
                 least[i], association[i] = squared[i], near[i]
     return association

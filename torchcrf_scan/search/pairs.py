@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.start import FARTHEST, Start
 from torchcrf_scan.loops.jit import Array
 from torchcrf_scan.loops.pair import Pair, PairStart, array_of, padded, pair_of
 from torchcrf_scan.loops.shape import resolution
@@ -90,7 +90,7 @@ def nothing_found(pair: Pair, clusters: int) -> PairStart:
         is_background,
         np.full(N, -1, np.int64),
         np.zeros((M, 2)),
-        np.tile(is_background, (N, 1)),
+        np.tile(np.where(is_background, 0.0, FARTHEST), (N, 1)),
         np.where(is_background, np.inf, -np.inf),
     )
 
@@ -99,13 +99,13 @@ def start_tensors(starts: Sequence[PairStart], batch: ScanPairBatch) -> Start:
     """The starts of all pairs of a batch, padded as the batch is."""
     N, M, clusters = batch.source.shape[1], batch.target.shape[1], len(starts[0].active)
     like = batch.source
-    in_reach = np.broadcast_to(np.arange(clusters) == 0, (N, clusters))  # everything is within reach of the background, padding too
+    beyond = np.broadcast_to(np.where(np.arange(clusters) == 0, 0.0, FARTHEST), (N, clusters))  # padding is background
     return Start(
         motions=torch.from_numpy(np.stack([start.motions for start in starts])).to(like),
         active=torch.from_numpy(np.stack([start.active for start in starts])).to(like.device),
         association=padded([start.association for start in starts], (N,), -1).to(like.device),
         target_tangents=padded([start.target_tangents for start in starts], (M, 2), 0.0).to(like),
-        reach=padded([start.reach for start in starts], (N, clusters), in_reach).to(like.device),
+        reach=padded([start.reach for start in starts], (N, clusters), beyond).to(like),
         log_odds=torch.from_numpy(np.stack([start.log_odds for start in starts])).to(like),
     )
 
@@ -113,7 +113,7 @@ def start_tensors(starts: Sequence[PairStart], batch: ScanPairBatch) -> Start:
 def start_arrays(start: Start, b: int, pair: Pair) -> PairStart:
     """The start of pair b without the padding."""
     n, m, C = len(pair.source), len(pair.target), start.motions.shape[1]
-    reach = np.ones((n, C), np.bool_) if start.reach is None else np.ascontiguousarray(start.reach[b, :n].cpu().numpy())
+    reach = np.zeros((n, C)) if start.reach is None else array_of(start.reach[b, :n])
     return PairStart(
         array_of(start.motions[b]),
         start.active[b].cpu().numpy().copy(),

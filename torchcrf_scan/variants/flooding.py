@@ -124,9 +124,10 @@ class Flooding:
         at = clustering.correspond(
             batch.source[:, around], batch.target, state.motions.value, found.nearest[:, around], state.association[:, around]
         )
-        local = clustering_unary(self.view, at, state.motions.value, state.motions.active, scales)
+        reach = None if self.start.reach is None else self.start.reach[:, around]
+        local = clustering_unary(self.view, at, state.motions.value, state.motions.active, scales, reach)
         pairwise = clustering.pairwise_features(batch.source[:, around], at, scales)
-        possible = possible_clusters(state.motions.active, self.start.reach, batch.source.shape[1])[:, around]
+        possible = possible_clusters(state.motions.active, self.view.within(reach), around.stop - around.start)
         unary, edges = clustering_potentials(local, pairwise, possible, self.parameters.clustering)
         k = i - around.start
         before = edges[:, k - 1] if k > 0 else None

@@ -162,8 +162,9 @@ def update_labels(
     """An exact pass over the chain of super-nodes, which decides both labels of a point at once (spec 7.7)."""
     batch, motions = view.batch, state.motions
     states = AssociationStates.of(view, found.index, found.mask, parameters.scales, parameters.boosters)
-    possible = possible_clusters(motions.active, start.reach, batch.source.shape[1])
-    features = lattice_features(view, states, motions.value, found.nearest, possible, parameters.scales, parameters.boosters)
+    possible = possible_clusters(motions.active, view.within(start.reach), batch.source.shape[1])
+    fitted = parameters.scales, parameters.boosters
+    features = lattice_features(view, states, motions.value, found.nearest, possible, *fitted, start.reach)
     potentials = features.potentials(torch.cat([parameters.association, parameters.clustering]))
     extra = lattice_extra(view.learned, found.index, possible.shape[-1])
     potentials = replace(potentials, log_unary=add_log(potentials.log_unary, extra))

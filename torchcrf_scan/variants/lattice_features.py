@@ -92,7 +92,7 @@ class LatticeFeatures:
 
     Attributes:
         static: (B, N, A, 12) features of j alone: L1..L11 and the outlier booster's margin.
-        moving: (B, N, A, D, 19) registered translation, the data booster's margin, the association's extension, C1..C4, the
+        moving: (B, N, A, D, 20) registered translation, the data booster's margin, the association's extension, C1..C4, the
             clustering's extension.
         pairwise_association: (B, N-1, A, A, 4) P1..P4.
         elastic: (B, N-1, A, A, 3) Q4..Q6 of two candidates, for the kinds of cluster transitions to which they apply.
@@ -108,7 +108,7 @@ class LatticeFeatures:
     mask: Tensor
 
     def potentials(self, weights: Tensor) -> LatticePotentials:
-        """Log potentials. weights: (43,), association before clustering."""
+        """Log potentials. weights: (44,), association before clustering."""
         log_unary = (self.static @ weights[list(STATIC_WEIGHTS)])[..., None] + self.moving @ weights[list(MOVING_WEIGHTS)]
         by_kind = weights[ELASTIC_WEIGHTS, None] * weights.new_tensor(ELASTIC_KINDS)  # (3 features, 3 kinds)
         log_association = (self.pairwise_association @ weights[ASSOCIATION_PAIRWISE])[..., None] + self.elastic @ by_kind
@@ -125,6 +125,7 @@ def lattice_features(
     possible: Tensor,
     scales: Scales,
     boosters: Boosters,
+    reach: Tensor | None = None,
     found: AssociationStates | None = None,
 ) -> LatticeFeatures:
     """Features of every super-node, its point moved by its own cluster's motion.
@@ -136,6 +137,7 @@ def lattice_features(
     Args:
         states: candidates (B, N, K) with their static features. motions: (B, C, 3).
         nearest: (B, N, C) nearest target point under every motion. possible: (B, N, D) clusters that are not ruled out.
+        reach: (B, N, C) as in `features.potentials.contradictions`.
         found: the states that inference would find, for the inputs of the outlier booster; None: `states`.
     """
     batch = view.batch
@@ -147,7 +149,7 @@ def lattice_features(
         of_found = registered_under_all(at.moved, batch.target, found.candidates, possible, scales)
         margin = outlier_margin(found, of_found[-1], boosters)
     registered = torch.cat([registered, best[..., None]], dim=-1)  # (B, N, K, D)
-    of_association, of_cluster = extension_channels(view, states, at, distance, motions, possible, scales)
+    of_association, of_cluster = extension_channels(view, states, at, distance, motions, possible, scales, reach)
     residual = at.residual.masked_fill(~possible[..., :-1], torch.inf).amin(-1)
     return LatticeFeatures(
         static=unary_at(states, best, scales, boosters, margin)[..., list(STATIC_WEIGHTS)],
@@ -217,8 +219,9 @@ def extension_channels(
     motions: Tensor,
     possible: Tensor,
     scales: Scales,
+    reach: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Both chains' extensions of every super-node, (B, N, A, D, 5) and (B, N, A, D, 8).
+    """Both chains' extensions of every super-node, (B, N, A, D, 5) and (B, N, A, D, 9).
 
     A point in the outlier cluster is evaluated under the background's motion. An outlier of the association is compared with the
     nearest target point. at: the points without associations; distance: (B, N, K, C).
@@ -240,7 +243,7 @@ def extension_channels(
         seen = FreeSpace(back.seen_through[:, row], back.hidden[:, row])
         is_inlier = torch.full_like(at.is_inlier, j < K)
         residual = distance[:, :, j] if j < K else at.residual
-        clusters.append(clustering_extension(residual, ahead, seen, is_inlier, scales))
+        clusters.append(clustering_extension(residual, ahead, seen, is_inlier, reach if view.reach == "soft" else None, scales))
     return torch.stack(chains, dim=3), torch.stack(clusters, dim=2)
 
 

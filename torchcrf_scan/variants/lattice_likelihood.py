@@ -58,7 +58,7 @@ class LatticeChain(LatticeFeatures):
     extra: Tensor | None = None
 
     def design(self) -> Design:
-        """The 43 features of every super-node at its true neighbours; the index of state (j, k) is j D + k."""
+        """The 44 features of every super-node at its true neighbours; the index of state (j, k) is j D + k."""
         D = self.mask.shape[3]
         features = self.moving.new_zeros(*self.mask.shape, WEIGHTS)
         features[..., list(STATIC_WEIGHTS)] = self.static[:, :, :, None]
@@ -81,7 +81,7 @@ class LatticeChain(LatticeFeatures):
         return sum(a[:, :, :, None] * c[:, :, None] for a, c in zip(of_association, of_cluster, strict=True))  # type: ignore[return-value]
 
     def log_likelihood(self, weights: Tensor) -> Tensor:
-        """(B,) exact log p(both true labellings | observation); 0 for unannotated nodes. weights: (43,)."""
+        """(B,) exact log p(both true labellings | observation); 0 for unannotated nodes. weights: (44,)."""
         potentials = self.potentials(weights)
         potentials = replace(potentials, log_unary=add_log(potentials.log_unary, self.extra)).cut(self.known)
         states = self.mask.shape[2] * self.mask.shape[3]
@@ -109,8 +109,8 @@ def lattice_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Bo
     batch = view.batch
     found = find_candidates(view, plugins.motions, plugins.active, config)
     as_found, states, association = states_with_truth(view, found, scales, boosters)
-    possible = possible_clusters(plugins.active, plugins.reach, batch.source.shape[1])
-    features = lattice_features(view, states, plugins.motions, found.nearest, possible, scales, boosters, as_found)
+    possible = possible_clusters(plugins.active, view.within(plugins.reach), batch.source.shape[1])
+    features = lattice_features(view, states, plugins.motions, found.nearest, possible, scales, boosters, plugins.reach, as_found)
     return LatticeChain(
         **{f.name: getattr(features, f.name) for f in fields(LatticeFeatures)},
         association=association,

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import InferenceConfig
-from torchcrf_scan.features.potentials import PairView
+from torchcrf_scan.features.potentials import PairView, resolution
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.start import Start, beyond_reach
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.loops.pair import array_of
 from torchcrf_scan.search.cold import ransac_motions
@@ -84,31 +84,34 @@ def movers_from_associations(
     motions = background[:, None].repeat(1, clusters, 1)
     active = torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
     active[:, 0] = True
+    members = torch.zeros(*active.shape, residual.shape[1], dtype=torch.bool, device=motions.device)
     for b in range(len(batch)):
         index = elsewhere[b].nonzero()[:, 0]
-        found = run_motions(batch.source[b, index], partner[b, index], index)[: clusters - 1]
+        found, runs = (of[: clusters - 1] for of in run_motions(batch.source[b, index], partner[b, index], index))
         motions[b, 1 : 1 + len(found)], active[b, 1 : 1 + len(found)] = found, True
-    return Start(motions, active, association, tangents)
+        members[b, 1 : 1 + len(found), index] = runs
+    return Start(motions, active, association, tangents, beyond_reach(batch.source, members, resolution(batch)))
 
 
-def run_motions(source: Tensor, partner: Tensor, index: Tensor) -> Tensor:
-    """(G, 3) motions of runs of associated points, merged where one explains the other, largest support first.
+def run_motions(source: Tensor, partner: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    """(G, 3) motions and (G, P) points of runs of associated points, those that another explains left out, the largest first.
 
     Args:
         source, partner: (P, 2). index: (P,) ascending point numbers; a run ends at a gap in number or in space.
     """
     if len(source) < FEWEST:
-        return source.new_zeros(0, 3)
+        return source.new_zeros(0, 3), source.new_zeros(0, len(source), dtype=torch.bool)
     apart = (index.diff() > INDEX_GAP) | (torch.linalg.vector_norm(source.diff(dim=0), dim=-1) > SPATIAL_GAP)
     run = torch.cat([apart.new_zeros(1, dtype=torch.int64), apart.long().cumsum(0)])
     members = run == torch.arange(int(run[-1]) + 1, device=run.device)[:, None]  # (R, P)
     members = members[members.sum(-1) >= FEWEST]
     members = members[members.sum(-1).argsort(descending=True, stable=True)]
-    kept: list[Tensor] = []
+    kept, runs = [source.new_zeros(0, 3)], [members[:0]]
     while len(members):
         motion = kabsch(source, partner, members[0].to(source))
         error = torch.linalg.vector_norm(se2.apply(motion, source) - partner, dim=-1)
         medians = torch.where(members, error, torch.nan).nanmedian(-1).values
-        kept.append(motion)
+        kept.append(motion[None])
+        runs.append(members[:1])
         members = members[1:][medians[1:] > EXPLAINED]
-    return torch.stack(kept) if kept else source.new_zeros(0, 3)
+    return torch.cat(kept), torch.cat(runs)

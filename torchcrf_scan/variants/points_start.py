@@ -8,12 +8,12 @@ from torch import Tensor
 from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.features import clustering
 from torchcrf_scan.features.candidates import by_motion
-from torchcrf_scan.features.potentials import PairView, possible_clusters
+from torchcrf_scan.features.potentials import PairView, possible_clusters, resolution
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.kabsch import kabsch
 from torchcrf_scan.inference.messages import chain_beliefs
-from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.start import Start, beyond_reach
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.names import CLUSTERING_UNARY, PAPERS_CLUSTER
 from torchcrf_scan.variants.paper_start import FEWEST, match_cold
@@ -34,13 +34,15 @@ def points_start(view: PairView, found: Start, parameters: Parameters, config: I
     motions = background[:, None].repeat(1, clusters, 1)
     active = torch.zeros(motions.shape[:2], dtype=torch.bool, device=motions.device)
     active[:, 0] = True
+    known = torch.zeros(*active.shape, association.shape[1], dtype=torch.bool, device=motions.device)
     for b in range(len(batch)):
         members = cluster_by_point(view, b, background[b], association[b], parameters)[:clusters]
         if len(members):
             partner = gather_points(batch.target[b : b + 1], association[b : b + 1].clamp(min=0)).expand(len(members), -1, -1)
             motions[b, : len(members)] = kabsch(batch.source[b].expand_as(partner), partner, members.to(batch.source))
             active[b, : len(members)] = True
-    return Start(motions, active, association, found.target_tangents)
+            known[b, : len(members)] = members
+    return Start(motions, active, association, found.target_tangents, beyond_reach(batch.source, known, resolution(batch)))
 
 
 def cluster_by_point(view: PairView, b: int, background: Tensor, association: Tensor, parameters: Parameters) -> Tensor:
