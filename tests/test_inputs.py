@@ -26,7 +26,7 @@ def annotated() -> ScanPairBatch:
 
 def full_start(batch: ScanPairBatch) -> Start:
     start = make_start(batch, MOTIONS[:2])
-    return replace(start, reach=torch.ones(1, N, 2).bool(), log_odds=torch.zeros(1, 2).double())
+    return replace(start, reach=torch.zeros(1, N, 2).double(), log_odds=torch.zeros(1, 2).double())
 
 
 def given() -> dict[str, Any]:
@@ -129,7 +129,7 @@ def test_a_search_takes_the_models_kind_of_batch_alone(model: JointScanCRF) -> N
 def test_under_autocast_a_network_may_give_what_it_calculates_in() -> None:
     model, everything = JointScanCRF(ModelConfig(features=FeatureConfig(embedding="dot"))), given()
     batch, start = everything["batch"].to(torch.float32), everything["start"]
-    start = replace(start, **{name: getattr(start, name).float() for name in ("motions", "target_tangents", "log_odds")})
+    start = replace(start, **{name: getattr(start, name).float() for name in ("motions", "target_tangents", "reach", "log_odds")})
     half = {name: everything[name].bfloat16() for name in ("source_embedding", "target_embedding")}
     with torch.autocast("cpu", torch.bfloat16):
         assert model(batch, start, **half).log_association.dtype == torch.float32

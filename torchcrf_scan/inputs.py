@@ -38,7 +38,7 @@ START: Layout = {
     "active": (("B", "C"), torch.bool),
     "association": (("B", "N"), torch.int64),
     "target_tangents": (("B", "M", 2), None),
-    "reach": (("B", "N", "C"), torch.bool),
+    "reach": (("B", "N", "C"), None),
     "log_odds": (("B", "C"), None),
 }
 PLUGINS: Layout = {
@@ -48,7 +48,7 @@ PLUGINS: Layout = {
     "cluster": (("B", "N"), torch.int64),
     "label": (("B", "N"), torch.int64),
     "known": (("B", "N"), torch.bool),
-    "reach": (("B", "N", "C"), torch.bool),
+    "reach": (("B", "N", "C"), None),
 }
 EXTRA: Layout = {"outlier": (("B", "N"), None), "moving": (("B", "N"), None)}
 
@@ -118,7 +118,7 @@ def check_tensor(
         raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
     device = like.device.type
     allowed = [like.dtype if dtype is None else dtype]
-    if is_learned and torch.is_autocast_enabled(device):
+    if is_learned and torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device):
         allowed.append(torch.get_autocast_dtype(device))
     if value.dtype not in allowed:
         raise ValueError(f"{name}: expected dtype {' or '.join(map(str, allowed))}, got {value.dtype}")

@@ -30,7 +30,7 @@ from torchcrf_scan.inference.state import ClusterPotential, Parameters
 from torchcrf_scan.inference.uncertainty import Calibration
 from torchcrf_scan.inputs import check_batch, check_inputs, check_plugins, check_start
 from torchcrf_scan.loops.pair import pair_of_scans
-from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, SCALED_EDGES
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.pretrained import PRETRAINED, find_weights, load_state, read_config, write_model
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
@@ -117,7 +117,8 @@ class JointScanCRF(nn.Module):
     def view(self, batch: ScanPairBatch, learned: LearnedInputs | None = None) -> PairView:
         """The batch prepared for the features, computed once. learned: output of `learned_inputs`."""
         features = self.config.features
-        return PairView.of(batch, features.wrap_closed, features.length_unit, learned, features.reach)
+        has_lengths = not {f"association.{name}" for name in SCALED_EDGES} <= {*features.left_out}
+        return PairView.of(batch, features.wrap_closed, features.length_unit, learned, features.reach, has_lengths)
 
     def learned_inputs(
         self,

@@ -95,32 +95,36 @@ def outlier_inputs(local: Tensor, data_margin: Tensor, candidates: Tensor, candi
     return torch.cat([best_local, best[..., None], gap[..., None]], dim=-1)
 
 
-def pairwise_features(source_points: Tensor, target_points: Tensor, candidates: Tensor, scales: Scales) -> Tensor:
+def pairwise_features(
+    source_points: Tensor, target_points: Tensor, candidates: Tensor, scales: Scales, *, has_lengths: bool = True
+) -> Tensor:
     """P1..P4 on every edge (i, i+1): sequence, pairwise outlier, pairwise distance, pairwise translation (spec 3).
 
     Args:
         source_points: (B, N, 2); target_points: (B, M, 2); candidates: (B, N, K).
+        has_lengths: False: P3 and P4 of two inliers, of which the model has no weight, are 0.
 
     Returns:
         (B, N-1, K+1, K+1, 4); the last state is the outlier. Costs N K^2.
     """
     index_step = candidates[:, 1:, None, :] - candidates[:, :-1, :, None]  # (B, N-1, K, K)
-    q = gather_points(target_points, candidates)
-    v2 = q[:, 1:, None, :] - q[:, :-1, :, None]  # (B, N-1, K, K, 2)
-    v1 = (source_points[:, 1:] - source_points[:, :-1])[:, :, None, None]  # (B, N-1, 1, 1, 2)
-    d1, d2 = torch.linalg.vector_norm(v1, dim=-1), torch.linalg.vector_norm(v2, dim=-1)
-    inliers = torch.stack(
-        [
-            (index_step == 1).to(q.dtype),
-            torch.zeros_like(d2),
-            robust_square(d1 - d2, scales.pairwise[0]),
-            robust_square(torch.linalg.vector_norm(v1 - v2, dim=-1), scales.pairwise[1]),
-        ],
-        dim=-1,
-    )
+    in_sequence = (index_step == 1).to(source_points.dtype)
+    inliers = torch.stack([in_sequence, *[torch.zeros_like(in_sequence)] * 3], dim=-1)
+    if has_lengths:
+        lengths = length_features(source_points, gather_points(target_points, candidates), scales)
+        inliers = torch.cat([inliers[..., :2], lengths], dim=-1)
     switch = torch.cat([scales.pairwise_outlier.new_tensor([0.0, 1.0]), scales.pairwise_outlier])
     stay = torch.cat([scales.pairwise_outlier.new_zeros(2), scales.pairwise_outlier])
     B, E, K = inliers.shape[:3]
     rows = torch.cat([inliers, switch.expand(B, E, K, 1, 4)], dim=3)
     last = torch.cat([switch.expand(B, E, 1, K, 4), stay.expand(B, E, 1, 1, 4)], dim=3)
     return torch.cat([rows, last], dim=2)
+
+
+def length_features(source_points: Tensor, partner: Tensor, scales: Scales) -> Tensor:
+    """(B, N-1, K, K, 2) P3 and P4 of two inliers. partner: (B, N, K, 2) the candidates' points."""
+    v2 = partner[:, 1:, None, :] - partner[:, :-1, :, None]  # (B, N-1, K, K, 2)
+    v1 = (source_points[:, 1:] - source_points[:, :-1])[:, :, None, None]  # (B, N-1, 1, 1, 2)
+    d1, d2 = torch.linalg.vector_norm(v1, dim=-1), torch.linalg.vector_norm(v2, dim=-1)
+    shift = torch.linalg.vector_norm(v1 - v2, dim=-1)
+    return torch.stack([robust_square(d1 - d2, scales.pairwise[0]), robust_square(shift, scales.pairwise[1])], dim=-1)

@@ -56,7 +56,7 @@ class PairView:
         factor: (B,) that unit's factor on metres.
         source_sweep, target_sweep: the scans in polar coordinates about their sensors.
         learned: embeddings and extra log potentials; None: none.
-        reach: as in `FeatureConfig`.
+        reach: as in `FeatureConfig`. has_lengths: whether the model has the association chain's features P3 and P4.
     """
 
     batch: ScanPairBatch
@@ -67,6 +67,7 @@ class PairView:
     target_sweep: Sweep
     learned: LearnedInputs | None = None
     reach: str = "hard"
+    has_lengths: bool = True
 
     @classmethod
     def of(
@@ -76,13 +77,14 @@ class PairView:
         length_unit: str = "metre",
         learned: LearnedInputs | None = None,
         reach: str = "hard",
+        has_lengths: bool = True,
     ) -> PairView:
         """Computes the descriptors of both scans.
 
         Args:
             wrap_closed: neighbours wrap on a closed scan (A-06); off, they clamp as in the paper.
             length_unit: `metre`, or `spacing`: lengths relative to the resolution of the pair's scans.
-            learned, reach: see above.
+            learned, reach, has_lengths: see above.
         """
         factor = torch.ones_like(batch.dt) if length_unit == "metre" else REFERENCE_UNIT / resolution(batch)
         batch = batch.scaled(factor)
@@ -98,6 +100,7 @@ class PairView:
             Sweep.of(batch.target, batch.target_mask, target_closed, batch.range_noise, batch.target_origin),
             learned,
             reach,
+            has_lengths,
         )
 
     def within(self, reach: Tensor | None) -> Tensor | None:

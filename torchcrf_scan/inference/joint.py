@@ -206,7 +206,7 @@ def update_association(view: PairView, state: State, found: Candidates, paramete
     states = AssociationStates.of(view, found.index, found.mask, scales, boosters)
     moved = registered_points(batch.source, state.motions.value, state.motions.active, state.log_cluster)
     unary = association_unary(view, states, moved, scales, boosters)
-    pairwise = pairwise_features(batch.source, batch.target, found.index, scales)
+    pairwise = pairwise_features(batch.source, batch.target, found.index, scales, has_lengths=view.has_lengths)
     extra = association_extra(view.learned, found.index)
     potentials = association_potentials(unary, pairwise, found.mask, parameters.association, extra)
     log_association = chain_beliefs(*potentials, batch.source_mask, config.temperature, in_loops=config.backend != "eager")

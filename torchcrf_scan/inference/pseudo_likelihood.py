@@ -145,16 +145,26 @@ def _truth_of(batch: ScanPairBatch) -> Truth:
     return batch.truth
 
 
-def association_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> Chain:
-    """The association chain's 19 + 4 features; states are the candidates of inference and the true target point."""
+def association_chain(
+    view: PairView,
+    plugins: PlugIns,
+    scales: Scales,
+    boosters: Boosters,
+    config: InferenceConfig,
+    found: candidate_search.Candidates | None = None,
+) -> Chain:
+    """The association chain's 19 + 4 features; states are the candidates of inference and the true target point.
+
+    found: the candidates at the plug-ins' motions; None: they are searched.
+    """
     batch = view.batch
-    found = find_candidates(view, plugins.motions, plugins.active, config)
+    found = found or find_candidates(view, plugins.motions, plugins.active, config)
     as_found, states, label = states_with_truth(view, found, scales, boosters)
     C = plugins.motions.shape[1]
     one_hot = torch.nn.functional.one_hot(plugins.cluster.clamp(min=0), C + 1).to(batch.source.dtype)
     moved = registered_points(batch.source, plugins.motions, plugins.active, one_hot)
     unary = association_unary(view, states, moved, scales, boosters, as_found)
-    pairwise = pairwise_features(batch.source, batch.target, states.candidates, scales)
+    pairwise = pairwise_features(batch.source, batch.target, states.candidates, scales, has_lengths=view.has_lengths)
     extra = association_extra(view.learned, states.candidates)
     return Chain(unary, pairwise, state_mask(states.mask), label, plugins.known & batch.source_mask, extra)
 
@@ -180,11 +190,14 @@ def association_design(view: PairView, plugins: PlugIns, scales: Scales, booster
     return association_chain(view, plugins, scales, boosters, config).design()
 
 
-def clustering_chain(view: PairView, plugins: PlugIns, scales: Scales) -> Chain:
-    """The clustering chain's 13 + 8 features."""
+def clustering_chain(
+    view: PairView, plugins: PlugIns, scales: Scales, found: candidate_search.Candidates | None = None
+) -> Chain:
+    """The clustering chain's 13 + 8 features. found: the candidates at the plug-ins' motions; None: they are searched."""
     batch = view.batch
     C = plugins.motions.shape[1]
-    found = candidate_search.by_motion(batch.source, batch.target, batch.target_mask, plugins.motions, plugins.active, 1)
+    scans = batch.source, batch.target, batch.target_mask
+    found = found or candidate_search.by_motion(*scans, plugins.motions, plugins.active, 1)
     at = clustering.correspond(batch.source, batch.target, plugins.motions, found.nearest, plugins.association)
     local = clustering_unary(view, at, plugins.motions, plugins.active, scales, plugins.reach)
     pairwise = clustering.pairwise_features(batch.source, at, scales)
@@ -226,11 +239,13 @@ def beside_true_neighbours(pairwise: Tensor, label: Tensor, known: Tensor) -> tu
 def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Parameters, config: ModelConfig) -> Tensor:
     """(B,) log pseudo-likelihood summed over nodes and over the chains of the model."""
     total = view.batch.source.new_zeros(len(view.batch))
+    found = find_candidates(view, plugins.motions, plugins.active, config.inference)  # the same for both chains
     if config.has_association:
-        design = association_design(view, plugins, parameters.scales, parameters.boosters, config.inference)
-        total = total + design.log_likelihood(parameters.association).sum(-1)
+        chain = association_chain(view, plugins, parameters.scales, parameters.boosters, config.inference, found)
+        total = total + chain.design().log_likelihood(parameters.association).sum(-1)
     if config.has_clusters:
-        total = total + clustering_design(view, plugins, parameters.scales).log_likelihood(parameters.clustering).sum(-1)
+        chain = clustering_chain(view, plugins, parameters.scales, found)
+        total = total + chain.design().log_likelihood(parameters.clustering).sum(-1)
     return total
 
 
