@@ -148,7 +148,7 @@ def test_set_weights_follows_the_names() -> None:
 
 
 def test_set_weights_passes_over_what_the_model_does_not_have() -> None:
-    model = JointScanCRF(ModelConfig(features=FeatureConfig(free_space=False, decisions=False, left_out=())))
+    model = JointScanCRF(ModelConfig(features=FeatureConfig(free_space=False, decisions=False, reach="hard", left_out=())))
     set_weights(model, "association", torch.arange(23.0))
     set_weights(model, "clustering", torch.arange(21.0))
     assert [weight.item() for weight in model.parameters()] == [*PAPER_ASSOCIATION, *PAPER_CLUSTERING]
