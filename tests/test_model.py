@@ -43,7 +43,7 @@ CLUSTERING_EXTENSION = (
     *("outlier_seen_through", "outlier_hidden", "reach"),
 )
 FREE_SPACE = ("seen_through", "hidden")  # all names of such weights have one of them
-PAPER = FeatureConfig(free_space=False, decisions=False, left_out=())
+PAPER = FeatureConfig(free_space=False, decisions=False, reach="hard", left_out=())
 EVERYTHING = FeatureConfig(left_out=(), reach="soft")
 SOFT = {"motion_weights": "soft", "temperature": 1.0, "stop_early": False, "candidates": 0}
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3]], dtype=torch.float64)

@@ -88,7 +88,8 @@ class FeatureConfig:
         decisions: features for the inlier/outlier decision and for the nearest target point, as extension weights of both chains:
             a gate on the residual, a constant, the excess over the nearest. This and `free_space` off: the paper's 30.
         reach: how a point's distance from the segment that a mover was found by (`Start.reach`) bears on its cluster: `soft`, an
-            extension weight of the clustering chain; `hard`, a mover is impossible beyond the segment's reach; `off`, not at all.
+            extension weight of the clustering chain; `hard`, a mover is impossible beyond the segment's reach; `off` (in YAML with
+            quotes), not at all.
         left_out: features left out of the model, as `association.NAME` or `clustering.NAME` of a weight; a local channel is
             then hidden from the boosters too. By default the two that compare an edge's length, which reject sparsely sampled
             surfaces as outliers, and the decisions of the clustering chain, which cost it movers.

@@ -121,6 +121,22 @@ def test_the_literal_reading_learns_no_raw_weight(material: list[Material]) -> N
     assert all(model.association_weights[name].item() == 0 for name in LOCAL_CHANNELS)
 
 
+@pytest.mark.parametrize("objective", ["pseudo_likelihood", "likelihood"])
+@pytest.mark.parametrize("coupling", ["motions", "lattice"])
+def test_the_weight_of_the_reach_is_learned(objective: str, coupling: str, material: list[Material]) -> None:
+    learning = replace(LEARNING, objective=objective, max_steps=8)
+    weights = {}
+    for reach in ("soft", "hard", "off"):
+        features = FeatureConfig(stumps=4, reach=reach)
+        model = JointScanCRF(replace(MODEL, coupling=coupling, features=features))
+        fit(model, material[:1], learning)
+        weights[reach] = model.weight_vectors[1]
+    place = CLUSTERING_WEIGHTS.index("reach")
+    assert weights["soft"][place] > 0.1
+    assert weights["hard"][place] == weights["off"][place] == 0
+    assert not torch.equal(weights["hard"], weights["off"])
+
+
 def test_set_weights_follows_the_names() -> None:
     model = JointScanCRF(ModelConfig(features=FeatureConfig(reach="soft")))
     set_weights(model, "association", torch.arange(23.0))
@@ -132,7 +148,7 @@ def test_set_weights_follows_the_names() -> None:
 
 
 def test_set_weights_passes_over_what_the_model_does_not_have() -> None:
-    model = JointScanCRF(ModelConfig(features=FeatureConfig(free_space=False, decisions=False, left_out=())))
+    model = JointScanCRF(ModelConfig(features=FeatureConfig(free_space=False, decisions=False, reach="hard", left_out=())))
     set_weights(model, "association", torch.arange(23.0))
     set_weights(model, "clustering", torch.arange(21.0))
     assert [weight.item() for weight in model.parameters()] == [*PAPER_ASSOCIATION, *PAPER_CLUSTERING]

@@ -1,5 +1,7 @@
 """What the features take as observed in training: noisy truth, found motions that stand for it, and spurious ones to ignore."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from support import assert_close, generator, make_points
@@ -96,6 +98,18 @@ def test_spare_slots_hold_spurious_movers(share: float) -> None:
     assert plugins.active.tolist() == [[True] * 5]
     assert_close(plugins.motions[0], torch.stack([*MOTIONS, WRONG, WRONG + 2]))
     assert plugins.label[0].tolist() == batch.truth.cluster[0].tolist()  # type: ignore[union-attr]
+
+
+def test_reaches_are_those_of_the_true_points_and_of_the_spurious_segments() -> None:
+    batch = make_batch()
+    start = make_start(batch, [MOTIONS[0], WRONG, MOTIONS[2], MOTIONS[1]])
+    found = 3 * torch.rand(1, N, 4, generator=generator(1), dtype=torch.float64)
+    plugins = training_plugins(batch, replace(start, reach=found), LearningConfig(**QUIET), generator(0))
+    assert (plugins.reach[0, torch.arange(N), plugins.label[0].clamp(min=0)] == 0).all()
+    assert plugins.reach.max() > 0
+    assert torch.equal(plugins.motions[0, 3], WRONG)
+    assert torch.equal(plugins.reach[..., 3], found[..., 1])
+    assert training_plugins(batch, start, LearningConfig(**QUIET), generator(0)).reach is None
 
 
 def test_spare_slots_without_spurious_movers_stay_empty() -> None:
