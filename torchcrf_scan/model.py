@@ -209,13 +209,18 @@ class JointScanCRF(nn.Module):
         learned = self.learned_inputs(  # of the encoder and of the caller
             batch, start, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
         )
+        return self.decode(batch, start, learned)
+
+    def decode(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None = None) -> Prediction:
+        """The rounds from a start, with the output of `learned_inputs`: `forward` without its first two steps."""
         rounds = self._in_loops if self._suits_loops(self.config, batch, start, learned) else self._in_tensors  # the engine
         return rounds(batch, start, learned)  # potentials, messages, motions, repeated until convergence
 
     def _suits_loops(self, config: ModelConfig, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> bool:
         """Whether the loops can compute the rounds: on a CPU, for supported settings and gradients."""
         inputs = {"batch.source": batch.source, "batch.target": batch.target, "batch.initial_motion": batch.initial_motion}
-        inputs |= {"start.motions": start.motions} | dict(self.boosters.named_parameters(prefix="boosters"))
+        inputs |= {"start.motions": start.motions} | ({} if start.reach is None else {"start.reach": start.reach})
+        inputs |= dict(self.boosters.named_parameters(prefix="boosters"))
         slopes = [name for name, tensor in inputs.items() if torch.is_grad_enabled() and tensor.requires_grad]
         has_embeddings = learned is not None and learned.embeddings is not None
         is_transformed = any(debug_unwrap(tensor) is not tensor for tensor in (*self.parameters(), *inputs.values()))

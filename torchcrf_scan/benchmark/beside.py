@@ -20,6 +20,7 @@ from torchcrf_scan.scan import ScanPair
 
 BATCH = 32
 ROUNDS = 3  # of the rows with a gradient
+STEP = 16  # pairs of a step of training
 TASKS = {
     "cold, one pair": "match",
     "warm, one pair": "match_warm",
@@ -28,7 +29,19 @@ TASKS = {
     f"{ROUNDS} rounds forward and backward, one pair": "rounds",
     f"{ROUNDS} rounds forward and backward, a pair of {BATCH}": "rounds_batch",
     "pseudo-likelihood and its gradient, a pair": "likelihood",
+    f"step of an encoder on {STEP} fresh pairs, a pair": "step",
 }
+WORLDS = "street,fast_street,model_cars,model_cars_dominant,indoor,street_dominant,still_street,still_indoor"
+LEARNING = [  # as in configs/encoder.yaml
+    *("--learning.objective=likelihood", "--gradient.objective=likelihood", f"--gradient.worlds=[{WORLDS}]"),
+    *("--learning.predicted_share=0.5", "--learning.disturbance=1.2", "--gradient.fresh=1", "--gradient.workers=0"),
+    *(
+        f"--gradient.batch_size={STEP}",
+        f"--gradient.part={STEP // 2}",
+        "--gradient.augment.dropout=0.3",
+        "--gradient.augment.noise=1.5",
+    ),
+]
 PROGRAM = f"""
 import sys, time, torch
 from dataclasses import replace
@@ -59,6 +72,20 @@ def likelihood():
     model.zero_grad()
     (-model.pseudo_log_likelihood(ScanPairBatch.collate(many)).sum()).backward()
 
+def step():
+    if not learning:
+        from torchcrf_scan.experiment.parser import config_of, settings_parser
+        from torchcrf_scan.learning.gradient import Learner, portions_from
+        from torchcrf_scan.learning.objectives import make_objective
+        from torchcrf_scan.learning.ranks import Ranks
+        parser = settings_parser()
+        config, alone = config_of(parser.instantiate(parser.parse_args({LEARNING}))), Ranks()
+        learner = Learner(JointScanCRF.from_pretrained("encoder"), config.gradient, alone)
+        learning.extend([learner, make_objective(config), portions_from(0, config, [], alone)])
+    learner, objective, portions = learning
+    learner.descend(objective, portions)
+
+learning = []
 tasks = {{
     "match": (1, lambda k: model.match_pairs([pairs[k % len(pairs)]])),
     "match_warm": (1, lambda k: model.match_pairs([warm[k % len(pairs)]])),
@@ -67,6 +94,7 @@ tasks = {{
     "rounds": (1, lambda k: rounds(pairs[:1])),
     "rounds_batch": ({BATCH}, lambda k: rounds(many)),
     "likelihood": ({BATCH}, lambda k: likelihood()),
+    "step": ({STEP}, lambda k: step()),
 }}
 for line in sys.stdin:
     task, turn = line.split()

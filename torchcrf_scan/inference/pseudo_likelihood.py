@@ -190,9 +190,7 @@ def association_design(view: PairView, plugins: PlugIns, scales: Scales, booster
     return association_chain(view, plugins, scales, boosters, config).design()
 
 
-def clustering_chain(
-    view: PairView, plugins: PlugIns, scales: Scales, found: candidate_search.Candidates | None = None
-) -> Chain:
+def clustering_chain(view: PairView, plugins: PlugIns, scales: Scales, found: candidate_search.Candidates | None = None) -> Chain:
     """The clustering chain's 13 + 8 features. found: the candidates at the plug-ins' motions; None: they are searched."""
     batch = view.batch
     C = plugins.motions.shape[1]

@@ -62,7 +62,8 @@ def labelled_chains(
     learned = fitted.scales, fitted.boosters, inference
     start = start_of(model, portion) if portion.surveys or model.encoder is not None else None
     generator = torch.Generator().manual_seed(portion.seed)
-    view = model.view(batch, model.learned_inputs(batch, start))
+    inputs = model.learned_inputs(batch, start)
+    view = model.view(batch, inputs)
     if start is None:
         plugins = features.true_plugins(view.batch, inference.clusters - 1)
     else:
@@ -77,7 +78,7 @@ def labelled_chains(
         yield "association", features.association_chain(view, plugins, *learned), fitted.association
     if has_association and has_clusters and start is not None:
         with torch.no_grad():
-            predicted = model(batch.without_truth(), start).association
+            predicted = model.decode(batch.without_truth(), start, inputs).association
         plugins = mix_associations(plugins, predicted, config.predicted_share, generator)
     if has_clusters:
         yield "cluster", features.clustering_chain(view, plugins, fitted.scales), fitted.clustering
