@@ -92,8 +92,12 @@ def test_compiled_without_a_graph_break(model: JointScanCRF, cases: list[tuple[S
 
 @pytest.fixture(scope="module")
 def decided() -> JointScanCRF:
-    """A model that takes the start's movers as they are, which makes its program a quarter shorter."""
-    return JointScanCRF.from_pretrained(**{**SETTINGS, "movers": "threshold", "candidates": 4})
+    """A model that takes the start's movers as they are, which makes its program a quarter shorter; its reach is soft."""
+    settings = {**SETTINGS, "movers": "threshold", "candidates": 4}
+    model = JointScanCRF.from_pretrained(features={"reach": "soft"}, **settings)
+    with torch.no_grad():
+        model.clustering_weights["reach"].fill_(0.5)
+    return model
 
 
 @pytest.fixture(scope="module")
@@ -199,6 +203,7 @@ def test_decompositions_equal_the_operators() -> None:
 
 
 def soft(features: dict[str, Any] | None = None) -> JointScanCRF:
+    features = {"reach": "soft", **(features or {})}
     return JointScanCRF.from_pretrained(features=features, **{**SETTINGS, "motion_weights": "soft", "temperature": 1.0})
 
 
