@@ -70,7 +70,7 @@ def test_a_batch_is_its_pairs():
         plugins, scales, boosters = true_plugins(batch, 4), Scales().double(), Boosters(1).double()
         association = association_chain(PairView.of(batch), plugins, scales, boosters, InferenceConfig(candidates=4))
         clustering = clustering_chain(PairView.of(batch), plugins, scales)
-        return torch.stack([association.log_likelihood(normal(23)), clustering.log_likelihood(normal(20))])
+        return torch.stack([association.log_likelihood(normal(23)), clustering.log_likelihood(normal(21))])
 
     assert_close(values(pairs), torch.cat([values([pair]) for pair in pairs], dim=-1))
 

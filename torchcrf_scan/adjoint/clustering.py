@@ -189,7 +189,7 @@ def pull_cluster(
     Args:
         state: before the pass. tables: at it. nearest: (N, C) of `nearest_to_outliers`. log_cluster: (N, D) beliefs after the pass.
         slopes: (N, D) of the beliefs.
-        weights: (20,), outlier, moving: (N,), to_motions: (C, 3), slopes added to.
+        weights: (21,), outlier, moving: (N,), to_motions: (C, 3), slopes added to.
     """
     states = np.flatnonzero(state.active)
     N, P = len(log_cluster), len(states)

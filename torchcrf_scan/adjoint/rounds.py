@@ -31,7 +31,7 @@ class Inputs(NamedTuple):
     """Derivatives of a loss by what the rounds are given, summed over them.
 
     Attributes:
-        association: (23,), clustering: (20,) by the weights. outlier, moving: (N,) by the learned log potentials.
+        association: (23,), clustering: (21,) by the weights. outlier, moving: (N,) by the learned log potentials.
     """
 
     association: Array
