@@ -79,7 +79,7 @@ def test_a_model_without_the_option_has_the_weights_it_had() -> None:
     more = set(able.state_dict()) - set(plain.state_dict())
     assert more == {"association_weights.embedding", "association_weights.embedding_data"}
     assert set(plain.state_dict()) < set(able.state_dict())
-    assert [len(vector) for vector in able.weight_vectors] == [23, 20]
+    assert [len(vector) for vector in able.weight_vectors] == [23, 21]
 
 
 @pytest.mark.parametrize("coupling", ["motions", "lattice"])
