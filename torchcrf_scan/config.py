@@ -39,7 +39,8 @@ class InferenceConfig:
         temperature: 0 = max-product, 1 = sum-product.
         motion_metric: `point` (Kabsch, the paper's), `line` (robust point-to-line step) or `given`: the motions stay those of
             the start (`sweep` only).
-        motion_weights: `hard` (labels, the paper's) or `soft` (beliefs; gradients then reach the weights).
+        motion_weights: `hard` (labels, the paper's) or `soft` (beliefs; gradients then reach the weights through motions). With
+            `hard` only the last round has a gradient by the weights, so that the rounds before it cost no more than an answer.
         movers: `joint`: hypothesised movers are selected by their score and the clustering chain; `threshold`: by their score alone
             (always so in `flooding`).
         schedule: `sweep` (exact passes over each chain, motions between) or `flooding` (Algorithm 1 node by node).
@@ -48,8 +49,8 @@ class InferenceConfig:
             in shape (`shape`).
         min_extent: metres (scaled as by `length_unit: spacing`); a smaller cluster takes the background's rotation.
         detach_motion: no gradient passes through a motion into the features of the next pass; motions keep their own.
-        backend: engine of the rounds: `compiled` (loops in machine code, on a CPU, without gradients) or `eager` (tensors);
-            `auto`: compiled where that is possible.
+        backend: engine of the rounds: `compiled` (loops in machine code, on a CPU, with gradients by weights and extra potentials)
+            or `eager` (tensors); `auto`: compiled where that is possible.
         rotation_tolerance: radians; a motion whose rotation changes by less has converged.
         translation_tolerance: metres; a motion whose translation changes by less has converged.
     """

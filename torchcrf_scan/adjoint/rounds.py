@@ -95,6 +95,60 @@ def pull_refit(
     return before
 
 
+@kernel
+def pull_last_fit(scene: Scene, done: Done, slopes: Slopes, fitted: Fitted, settings: Settings) -> Array:
+    """(C, 3) slopes of the motions between both passes, through the fit after the second; adds those of the beliefs."""
+    before, after, share = done.before, done.after, 0.5 if done.is_damped else 1.0
+    turn = before.motions[0, 0] + (after.motions[0, 0] - before.motions[0, 0]) / share
+    as_fitted = State(
+        after.motions,
+        before.active,  # clusters are retired after the fit
+        after.empty_for,
+        after.association,
+        after.cluster,
+        after.candidates,
+        after.log_association,
+        after.log_cluster,
+    )
+    labels, beliefs = (after.association, after.cluster, after.log_cluster), (slopes.log_association, slopes.log_cluster)
+    return pull_refit(scene, as_fitted, *labels, done.between, turn, share * slopes.motions, *beliefs, fitted, settings)
+
+
+@kernel
+def pull_first_fit(
+    scene: Scene, done: Done, between: Array, to_association: Array, slopes: Slopes, fitted: Fitted, settings: Settings
+) -> Array:
+    """(C, 3) slopes of the motions before the round, through the fit after the first pass; adds those of the beliefs.
+
+    between: (C, 3) slopes of the motions after that fit. to_association: slopes of the beliefs before the round, added to.
+    """
+    before, after = done.before, done.after
+    labels, beliefs = (before.association, after.cluster, after.log_cluster), (to_association, slopes.log_cluster)
+    return pull_refit(scene, before, *labels, before.motions, done.between[0, 0], between, *beliefs, fitted, settings)
+
+
+@kernel
+def pull_second_pass(
+    scene: Scene, done: Done, slopes: Slopes, inputs: Inputs, work: Workspace, between: Array, fitted: Fitted
+) -> None:
+    """Adds the slopes through the pass over the association chain. between: (C, 3) of the motions it was made at, added to."""
+    after, active = done.after, done.before.active
+    moved = registered_points(scene.source, done.between, active, after.log_cluster)
+    sight = free_space_of(scene.target_sweep, moved)
+    at, given = (done.between, active, moved), (inputs.association, inputs.outlier)
+    pull_associate(scene, after, *at, *sight, fitted.association, work, slopes.log_association, *given, between)
+
+
+@kernel
+def pull_first_pass(scene: Scene, done: Done, slopes: Slopes, inputs: Inputs, start: Array, fitted: Fitted) -> None:
+    """Adds the slopes through the pass over the clustering chain. start: (C, 3) of the motions before the round, added to."""
+    before, model = done.before, fitted.clustering
+    tables = tables_of(scene, before, model)
+    nearest = nearest_to_outliers(scene.boxes, scene.source, before.motions, before.active, before.association)
+    given = inputs.clustering, inputs.outlier, inputs.moving
+    pull_cluster(scene, before, tables, nearest, done.after.log_cluster, model, slopes.log_cluster, *given, start)
+
+
 @entry
 def pull_round(
     scene: Scene, done: Done, slopes: Slopes, inputs: Inputs, work: Workspace, fitted: Fitted, settings: Settings
@@ -105,86 +159,16 @@ def pull_round(
         slopes: of the state after the round, changed in place. work: a cache of the static scores.
         With motions from labels no slope passes through them.
     """
-    before, after, between = done.before, done.after, done.between
-    active = before.active
-    undamped = State(
-        after.motions,
-        active,
-        after.empty_for,
-        after.association,
-        after.cluster,
-        after.candidates,
-        after.log_association,
-        after.log_cluster,
-    )
-    first, last = np.zeros_like(between), np.zeros_like(between)
-    to_association, halved = np.zeros_like(before.log_association), 0.5 if done.is_damped else 1.0
+    between, start = np.zeros_like(done.between), np.zeros_like(done.between)
+    to_association = np.zeros_like(done.before.log_association)
     if settings.is_soft:
-        last[:] = halved * slopes.motions
-        turn = after.motions[0, 0] if not done.is_damped else 2 * after.motions[0, 0] - before.motions[0, 0]
-        first[:] = pull_refit(
-            scene,
-            undamped,
-            after.association,
-            after.cluster,
-            after.log_cluster,
-            between,
-            turn,
-            last,
-            slopes.log_association,
-            slopes.log_cluster,
-            fitted,
-            settings,
-        )
-    moved = registered_points(scene.source, between, active, after.log_cluster)
-    seen_through, hidden = free_space_of(scene.target_sweep, moved)
-    pull_associate(
-        scene,
-        after,
-        between,
-        active,
-        moved,
-        seen_through,
-        hidden,
-        fitted.association,
-        work,
-        slopes.log_association,
-        inputs.association,
-        inputs.outlier,
-        first,
-    )
-    start = np.zeros_like(between)
+        between[:] = pull_last_fit(scene, done, slopes, fitted, settings)
+    pull_second_pass(scene, done, slopes, inputs, work, between, fitted)
     if settings.is_soft and not settings.detaches:
-        start[:] = pull_refit(
-            scene,
-            before,
-            before.association,
-            after.cluster,
-            after.log_cluster,
-            before.motions,
-            between[0, 0],
-            first,
-            to_association,
-            slopes.log_cluster,
-            fitted,
-            settings,
-        )
-    tables = tables_of(scene, before, fitted.clustering)
-    nearest = nearest_to_outliers(scene.boxes, scene.source, before.motions, active, before.association)
-    pull_cluster(
-        scene,
-        before,
-        tables,
-        nearest,
-        after.log_cluster,
-        fitted.clustering,
-        slopes.log_cluster,
-        inputs.clustering,
-        inputs.outlier,
-        inputs.moving,
-        start,
-    )
+        start[:] = pull_first_fit(scene, done, between, to_association, slopes, fitted, settings)
+    pull_first_pass(scene, done, slopes, inputs, start, fitted)
     if settings.detaches:
         start[:] = 0.0
-    start += (1 - halved) * slopes.motions
-    return Slopes(start, to_association, np.zeros_like(after.log_cluster))
+    if done.is_damped:
+        start += slopes.motions / 2
+    return Slopes(start, to_association, np.zeros_like(done.after.log_cluster))
