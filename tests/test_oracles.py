@@ -184,10 +184,10 @@ def test_extensions_of_a_point() -> None:
     assert found[2].tolist() == pytest.approx([-3, -1, 0, 0, 0])
     assert found[3].tolist() == [0, 0, 1, 0.5, 0.25]
     ahead, back = [(0.1, 0.2), (0.3, 0.4)], [(0.5, 0.6), (0.7, 0.8)]
-    partnered, alone = (oracles.clustering_extension([0.3, 9.0], ahead, back, 0.3, inlier) for inlier in (True, False))
-    assert partnered[0].tolist() == [-0.5, 0, -0.1, -0.5, -0.2, -0.6, 0, 0]
-    assert alone[1].tolist() == pytest.approx([-1, 0, -0.3, 0, -0.4, 0, 0, 0])
-    assert partnered[2].tolist() == alone[2].tolist() == [0, 1, 0, 0, 0, 0, 0.1, 0.2]
+    partnered, alone = (oracles.clustering_extension([0.3, 9.0], ahead, back, 0.3, inlier, [0.0, 2.0]) for inlier in (True, False))
+    assert partnered[0].tolist() == [-0.5, 0, -0.1, -0.5, -0.2, -0.6, 0, 0, 0]
+    assert alone[1].tolist() == pytest.approx([-1, 0, -0.3, 0, -0.4, 0, 0, 0, -4])
+    assert partnered[2].tolist() == alone[2].tolist() == [0, 1, 0, 0, 0, 0, 0.1, 0.2, 0]
     assert oracles.invert((math.pi / 2, 1.0, 0.0), (1.0, 3.0)) == pytest.approx((3, 0))
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.func import debug_unwrap
 
 from torchcrf_scan.adjoint import layer as adjoint
 from torchcrf_scan.adjoint.layer import Unrolled
@@ -29,6 +28,7 @@ from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import ClusterPotential, Parameters
 from torchcrf_scan.inference.uncertainty import Calibration
 from torchcrf_scan.inputs import check_batch, check_inputs, check_plugins, check_start
+from torchcrf_scan.loops.choice import is_in_transform
 from torchcrf_scan.loops.pair import pair_of_scans
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, SCALED_EDGES
 from torchcrf_scan.prediction import Prediction
@@ -223,7 +223,7 @@ class JointScanCRF(nn.Module):
         inputs |= dict(self.boosters.named_parameters(prefix="boosters"))
         slopes = [name for name, tensor in inputs.items() if torch.is_grad_enabled() and tensor.requires_grad]
         has_embeddings = learned is not None and learned.embeddings is not None
-        is_transformed = any(debug_unwrap(tensor) is not tensor for tensor in (*self.parameters(), *inputs.values()))
+        is_transformed = is_in_transform(*self.parameters(), *inputs.values())
         return can_decode(config, batch.source.device, slopes=slopes, has_embeddings=has_embeddings, is_transformed=is_transformed)
 
     def _in_loops(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:

@@ -173,6 +173,8 @@ class _Rounds(torch.autograd.Function):
             wide = [with_states(of.log_association, K + 1) for of in states]
             found.append(padded(wide, (N, K + 1), -math.log(K + 1)).to(like))
             found.append(padded([of.log_cluster for of in states], (N, D), -math.log(D)).to(like))
+        if not settings.is_soft:
+            ctx.mark_non_differentiable(*found[::3])  # motions of labels
         return tuple(found)
 
     @staticmethod

@@ -5,6 +5,7 @@ The method does not know the displacement; its results are transformed to the pa
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +28,9 @@ Turn = float | Literal["any"]
 @torch.no_grad()
 def predict(model: JointScanCRF, batch: ScanPairBatch) -> Prediction:
     """The model's answers, in double precision where the loops give them, as `match_pairs` does."""
-    return model(batch.to(torch.float64) if can_decode(model.config, batch.source.device) else batch)
+    if not can_decode(model.config, batch.source.device):
+        return model(batch)
+    return copy.deepcopy(model).double()(batch.to(torch.float64))
 
 
 METHODS: Mapping[str, Callable[[JointScanCRF, ScanPairBatch], Prediction]] = {

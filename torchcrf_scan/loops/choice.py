@@ -15,7 +15,12 @@ def is_readable(*tensors: Tensor) -> bool:
     """
     if torch.compiler.is_compiling():
         return False
-    return all(of.device.type == "cpu" and type(of) in (Tensor, Parameter) and debug_unwrap(of) is of for of in tensors)
+    return all(of.device.type == "cpu" and type(of) in (Tensor, Parameter) for of in tensors) and not is_in_transform(*tensors)
+
+
+def is_in_transform(*tensors: Tensor) -> bool:
+    """Whether a transform of `torch.func` works on any of the tensors; not asked in a compiled program."""
+    return not torch.compiler.is_compiling() and any(debug_unwrap(of) is not of for of in tensors)
 
 
 def has_operators(tensor: Tensor) -> bool:
