@@ -5,12 +5,13 @@ Worlds, poses and ray casting are at full size; `SimulatorConfig.scale` is appli
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
-from torchcrf_scan.data.world import Mover, Shapes, Viewer, World, draw_mover, indoor, street
+from torchcrf_scan.data.world import Mover, Shapes, Viewer, World, draw_mover, indoor, littered, street
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import MAX_RANGE_MARGIN, OUTLIER, Annotation, Bools, Floats, Ints, Scan, ScanPair
@@ -18,6 +19,8 @@ from torchcrf_scan.scan import MAX_RANGE_MARGIN, OUTLIER, Annotation, Bools, Flo
 ORIGIN = "torchcrf_scan simulator"
 STATIC = 0  # bodies in a scan: the static world, movers by number, and returns of no single body
 NO_BODY = -1
+UNSEEN = -2  # a body of the target that is not visible in the source
+UNKNOWN = -3  # a body that is left out of the annotation
 
 FARTHEST_WORLD = {"street": 90.0, "indoor": 25.0}  # metres of world ahead of the sensor
 TURNING_RADIUS = 4.5  # metres, minimum of a car; robots turn on the spot
@@ -29,6 +32,7 @@ LEAST_COSINE = 0.1  # the spacing of returns on a surface is limited to ten time
 GATE = 3.2  # times half the scan's usual spacing plus twice its noise; annotators of recordings use one gate for a whole scan
 LEAST_MOTION = 0.02  # metres at full size; bodies that move less within a pair are static
 SENSOR_CLEARANCE = 0.3  # metres between movers and the sensor
+SWEEP_PARTS = 24  # groups of beams that are cast at the same time, while a sensor sweeps
 LEAST_SEEN = 3  # minimum number of returns of a mover when it enters
 ENTRY_TRIES = {"any": 12, "truck": 80, "slider": 40}
 TRUCK_SHARE = (0.4, 0.5)  # of the returns
@@ -124,7 +128,8 @@ class Capture:
         scan: the valid returns, n of them.
         body: (n,) their bodies: `STATIC`, a mover's number, or `NO_BODY`.
         spacing: (n,) metres between neighbouring returns on the surface there.
-        time: seconds.
+        settled: (n, 2) their places in the sensor's frame had all beams been cast at `time`.
+        time: seconds, of the middle of the sweep.
         ego: (3,) the sensor's pose in the world, at full size.
         movers: those in the world at this time, visible or not.
     """
@@ -132,6 +137,7 @@ class Capture:
     scan: Scan
     body: Ints
     spacing: Floats
+    settled: Floats
     time: float
     ego: Floats
     movers: tuple[Mover, ...]
@@ -166,8 +172,8 @@ def _noise(bearings: Floats, config: SimulatorConfig, rng: np.random.Generator) 
     return rng.normal(0, config.range_noise, len(bearings)) + jolts
 
 
-def _measure(hits: Hits, config: SimulatorConfig, rng: np.random.Generator) -> tuple[Scan, Ints, Floats]:
-    """The measured scan of `hits`, and body and spacing (n,) of its returns."""
+def _measure(hits: Hits, config: SimulatorConfig, rng: np.random.Generator) -> tuple[Scan, Ints, Ints, Floats]:
+    """The measured scan of `hits`, and beam, body and spacing (n,) of its returns."""
     bearings, step = beam_bearings(config)
     ranges, body = _mix_edges(hits.ranges, hits.body, config, rng)
     ranges = config.scale * ranges + _noise(bearings, config, rng)
@@ -175,9 +181,10 @@ def _measure(hits: Hits, config: SimulatorConfig, rng: np.random.Generator) -> t
     lost = rng.random(len(ranges)) < config.dropout + (1 - config.dropout) * grazing
     keep = np.flatnonzero(~lost & (ranges > config.range_min) & (ranges < config.range_max - MAX_RANGE_MARGIN))
     limits = {"range_min": config.range_min, "range_max": config.range_max, "range_noise": config.range_noise}
+    limits = limits if config.states_limits else {}
     scan = Scan.from_ranges(ranges[keep], bearings[keep], **limits)
     assert len(scan) == len(keep)
-    return scan, body[keep], scan.ranges * step / np.maximum(hits.cosine[keep], LEAST_COSINE)
+    return scan, keep, body[keep], scan.ranges * step / np.maximum(hits.cosine[keep], LEAST_COSINE)
 
 
 # --- annotation ---------------------------------------------------------------------------------------------------------------
@@ -189,42 +196,63 @@ def association_gate(spacing: Floats, config: SimulatorConfig) -> float:
     return GATE * (float(np.median(spacing)) / 2 + 2 * noise)
 
 
-def _associate(moved: Floats, body: Ints, target: Capture, target_body: Ints, config: SimulatorConfig) -> Ints:
-    """(N,) the nearest target return of the same body within the gate, or -1. moved: (N, 2). O(N M)."""
+def _associate(moved: Floats, seen: Floats, body: Ints, target: Capture, target_body: Ints, config: SimulatorConfig) -> Ints:
+    """(N,) the target return of the same body that was seen nearest, of those truly within the gate, or -1. O(N M).
+
+    Args:
+        moved, seen: (N, 2) the moved source returns, where they were had the sweep taken no time, and as they were measured.
+    """
     association = np.full(len(moved), OUTLIER)
     if not len(moved) or not len(target_body):
         return association
-    offset = moved[:, None, :] - target.scan.points  # (N, M, 2)
-    distance = np.hypot(offset[..., 0], offset[..., 1])
-    is_candidate = (body[:, None] == target_body) & (distance <= association_gate(target.spacing, config))
-    distance[~is_candidate] = np.inf
+    is_near = _distances(moved, target.settled) <= association_gate(target.spacing, config)
+    distance = np.where((body[:, None] == target_body) & is_near, _distances(seen, target.scan.points), np.inf)
     nearest = distance.argmin(1)
     found = np.isfinite(distance[np.arange(len(moved)), nearest])
     association[found] = nearest[found]
     return association
 
 
+def _distances(points: Floats, others: Floats) -> Floats:
+    """(N, M) distances between (N, 2) and (M, 2) points."""
+    offset = points[:, None, :] - others  # (N, M, 2)
+    return np.hypot(offset[..., 0], offset[..., 1])
+
+
 def annotate(source: Capture, target: Capture, config: SimulatorConfig) -> Annotation:
     """Ground truth of every source return, from the true motions of the sensor and of every body."""
-    world = se2.compose(se2.inverse(target.ego), source.ego)
-    motions = [world]
-    label = {STATIC: 0, NO_BODY: -1}
+    table, label = _bodies(source, target, config)
+    body = np.array([label[b] for b in source.body], dtype=np.int64)
+    target_body = np.array([label.get(b, UNSEEN) for b in target.body], dtype=np.int64)
+    motion = table[np.maximum(body, 0)]
+    moved, seen = (se2.rotate(motion[:, 0], points) + motion[:, 1:] for points in (source.settled, source.scan.points))
+    partner = np.where(body < 0, OUTLIER, _associate(moved, seen, body, target, target_body, config))
+    ignore = body == UNKNOWN
+    body = np.where((body < 0) | ((source.body == NO_BODY) & (partner == OUTLIER)), NO_BODY, body)
+    return Annotation(partner, np.where(partner == OUTLIER, OUTLIER, body), table, body, ignore)
+
+
+def _bodies(source: Capture, target: Capture, config: SimulatorConfig) -> tuple[Floats, dict[int, int]]:
+    """(K + 1, 3) motions of the background and of the annotated movers, and the label of every body of the source."""
+    scale = np.array([1.0, config.scale, config.scale])
+    motions = [se2.compose(se2.inverse(target.ego), source.ego) * scale]
+    label = {STATIC: 0, NO_BODY: 0 if config.matches_mixed else NO_BODY}
+    least = config.least_travel * (association_gate(target.spacing, config) if config.least_travel and len(target.spacing) else 0.0)
     for mover in source.movers:
         before, after = mover.pose(source.time), mover.pose(target.time)
         if np.hypot(*(after - before)[1:]) < LEAST_MOTION and abs(se2.wrap(after[0] - before[0])) < LEAST_MOTION:
             label[mover.number] = 0
-        elif (source.body == mover.number).any():
+            continue
+        points = source.settled[source.body == mover.number]
+        to_world = se2.compose(after, se2.inverse(before))
+        motion = se2.compose(se2.inverse(target.ego), se2.compose(to_world, source.ego)) * scale
+        travel = np.hypot(*(se2.apply(motion, points) - se2.apply(motions[0], points)).T)
+        if len(points) and travel.max() < least:
+            label[mover.number] = UNKNOWN
+        elif len(points):
             label[mover.number] = len(motions)
-            to_world = se2.compose(after, se2.inverse(before))
-            motions.append(se2.compose(se2.inverse(target.ego), se2.compose(to_world, source.ego)))
-    unseen = -2  # a body of the target that is not visible in the source
-    body = np.array([label[b] for b in source.body], dtype=np.int64)
-    target_body = np.array([label.get(b, unseen) for b in target.body], dtype=np.int64)
-    table = np.stack(motions) * np.array([1.0, config.scale, config.scale])
-    points = source.scan.points
-    moved = se2.rotate(table[body, 0], points) + table[body, 1:]
-    partner = np.where(body == NO_BODY, OUTLIER, _associate(moved, body, target, target_body, config))
-    return Annotation(partner, np.where(partner == OUTLIER, OUTLIER, body), table, body, np.zeros(len(body), dtype=bool))
+            motions.append(motion)
+    return np.stack(motions), label
 
 
 # --- sequences ----------------------------------------------------------------------------------------------------------------
@@ -279,23 +307,55 @@ class _Drive:
     def capture(self, i: int) -> Capture:
         """The scan at time i; movers that were not visible in the scan before (all, at first) are replaced by new ones."""
         config, rng = self.config, self.rng
-        bearings, _ = beam_bearings(config)
-        reach = config.range_max / config.scale
-        static = _in_view(self.world.shapes.moved(se2.inverse(self.path[i])), reach, config.fov)
-        hits = cast(static, bearings, STATIC, rng)
+        hits = self._cast(lambda _: self.world.shapes, STATIC, i)
         for mover in self.movers.values():
-            hits = hits.nearer(self._cast_mover(mover, i))
+            hits = hits.nearer(self._cast(mover.at, mover.number, i))
         for place, kind in enumerate(self.kinds):
             if place not in self.movers:
                 hits = self._enter(place, kind, i, hits)
         movers = tuple(self.movers.values())
-        scan, body, spacing = _measure(hits, config, rng)
+        scan, beam, body, spacing = _measure(hits, config, rng)
         self.movers = {place: mover for place, mover in self.movers.items() if (body == mover.number).any()}
-        return Capture(scan, body, spacing, self.times[i], self.path[i], movers)
+        settled = self._settle(scan.points, beam, body, i, movers)
+        return Capture(scan, body, spacing, settled, self.times[i], self.path[i], movers)
 
-    def _cast_mover(self, mover: Mover, i: int) -> Hits:
-        shapes = mover.at(self.times[i]).moved(se2.inverse(self.path[i]))
-        return cast(shapes, beam_bearings(self.config)[0], mover.number, self.rng)
+    def _sweep(self) -> list[tuple[slice, float]]:
+        """The beams that are cast together, and the seconds from the middle of the sweep to their time."""
+        if self.config.sweep == 0:
+            return [(slice(0, self.config.beams), 0.0)]
+        edges = np.linspace(0, self.config.beams, SWEEP_PARTS + 1).round().astype(int)
+        return [(slice(a, b), self.config.sweep * ((a + b) / (2 * self.config.beams) - 0.5)) for a, b in pairwise(edges) if a < b]
+
+    def _pose(self, i: int, late: float) -> Floats:
+        """(3,) the sensor's pose `late` seconds after time i, at the speed of the step from there (of the last, at the end)."""
+        if late == 0:
+            pose: Floats = self.path[i]
+            return pose
+        step = min(i, len(self.times) - 2)
+        return se2.compose(self.path[i], late / self.config.dt * se2.compose(se2.inverse(self.path[step]), self.path[step + 1]))
+
+    def _cast(self, outlines: Callable[[float], Shapes], body: int, i: int) -> Hits:
+        """The hits of all beams on the outlines that a body has at a time, seconds."""
+        bearings, reach = beam_bearings(self.config)[0], self.config.range_max / self.config.scale
+        parts = []
+        for beams, late in self._sweep():
+            shapes = outlines(self.times[i] + late).moved(se2.inverse(self._pose(i, late)))
+            shapes = _in_view(shapes, reach, self.config.fov) if body == STATIC else shapes
+            parts.append(cast(shapes, bearings[beams], body, self.rng))
+        return Hits(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("ranges", "cosine", "body")))
+
+    def _settle(self, points: Floats, beam: Ints, body: Ints, i: int, movers: tuple[Mover, ...]) -> Floats:
+        """(n, 2) the returns (n, 2) where their bodies would have been seen, had all beams been cast at time i."""
+        settled, now = points.copy(), self.times[i]
+        for beams, late in self._sweep() if self.config.sweep > 0 else []:
+            in_part = (beam >= beams.start) & (beam < beams.stop)
+            carried = [(STATIC, np.zeros(3)), (NO_BODY, np.zeros(3))]
+            carried += [(m.number, se2.compose(m.pose(now), se2.inverse(m.pose(now + late)))) for m in movers]
+            for number, carry in carried:
+                on = in_part & (body == number)
+                motion = se2.compose(se2.inverse(self.path[i]), se2.compose(carry, self._pose(i, late)))
+                settled[on] = se2.apply(motion * np.array([1.0, self.config.scale, self.config.scale]), points[on])
+        return settled
 
     def _enter(self, place: int, kind: str, i: int, hits: Hits) -> Hits:
         """Places a new mover, if one of a few random ones is visible and unobstructed; returns the new hits."""
@@ -307,7 +367,7 @@ class _Drive:
             mover = draw_mover(self.rng, self.world, viewer, self.born + 1, float(self.times[i]), kind)
             if not _is_clear(mover, obstacles, self.times[i:]):
                 continue
-            seen = hits.nearer(self._cast_mover(mover, i))
+            seen = hits.nearer(self._cast(mover.at, mover.number, i))
             if self._is_seen(seen, mover.number, kind):
                 self.movers[place] = mover
                 self.born += 1
@@ -343,7 +403,9 @@ def _simulate_sequence(config: SimulatorConfig, pairs: int, rng: np.random.Gener
     kinds = (special + ["any"] * max(n_movers - len(special), 0))[: config.movers_max]
     beyond = min(config.range_max / config.scale, FARTHEST_WORLD[config.scene]) * rng.uniform(0.4, 1.0)
     build = street if config.scene == "street" else indoor
-    world = build(rng, -beyond if config.fov > 180 else -20.0, pairs * _longest_step(config) + beyond, config.clutter)
+    start, end = -beyond if config.fov > 180 else -20.0, pairs * _longest_step(config) + beyond
+    world = build(rng, start, end, config.clutter)
+    world = littered(rng, world, start, end, config.litter) if config.litter > 0 else world
     path = _ego_path(config, world, pairs, "truck" in kinds, rng)
     drive = _Drive(config, rng, world, path, config.dt * np.arange(pairs + 1, dtype=np.float64), kinds)
     return [drive.capture(i) for i in range(pairs + 1)]
