@@ -11,251 +11,23 @@ from itertools import pairwise
 
 import numpy as np
 
+from torchcrf_scan.data.annotate import STATIC, Capture, annotate
+from torchcrf_scan.data.laser import NO_BODY, Hits, beam_bearings, cast, in_view, measure
 from torchcrf_scan.data.world import Mover, Shapes, Viewer, World, draw_mover, indoor, littered, street
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.scan import MAX_RANGE_MARGIN, OUTLIER, Annotation, Bools, Floats, Ints, Scan, ScanPair
+from torchcrf_scan.scan import Bools, Floats, Ints, ScanPair
 
 ORIGIN = "torchcrf_scan simulator"
-STATIC = 0  # bodies in a scan: the static world, movers by number, and returns of no single body
-NO_BODY = -1
-UNSEEN = -2  # a body of the target that is not visible in the source
-UNKNOWN = -3  # a body that is left out of the annotation
 
 FARTHEST_WORLD = {"street": 90.0, "indoor": 25.0}  # metres of world ahead of the sensor
 TURNING_RADIUS = 4.5  # metres, minimum of a car; robots turn on the spot
 INDOOR_SPEED = 1.5  # m/s, the fastest robot
-VIBRATION_KNOTS = np.radians(8.0)  # angle over which neighbouring beams share a jolt
-MIXED_JUMP = (0.3, 6.0)  # metres at full size; ranges this far apart merge in one beam; farther ones give two separate echoes
-GRAZING_COSINE = 0.03  # loss of grazing beams: exp(-cosine / this)
-LEAST_COSINE = 0.1  # the spacing of returns on a surface is limited to ten times that at normal incidence
-GATE = 3.2  # times half the scan's usual spacing plus twice its noise; annotators of recordings use one gate for a whole scan
-LEAST_MOTION = 0.02  # metres at full size; bodies that move less within a pair are static
 SENSOR_CLEARANCE = 0.3  # metres between movers and the sensor
 SWEEP_PARTS = 24  # groups of beams that are cast at the same time, while a sensor sweeps
 LEAST_SEEN = 3  # minimum number of returns of a mover when it enters
 ENTRY_TRIES = {"any": 12, "truck": 80, "slider": 40}
 TRUCK_SHARE = (0.4, 0.5)  # of the returns
-
-
-# --- casting ------------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Hits:
-    """The first hit of every beam, at full size: (B,) `ranges` (inf: none), `cosine` of incidence, and `body`."""
-
-    ranges: Floats
-    cosine: Floats
-    body: Ints
-
-    def nearer(self, other: Hits) -> Hits:
-        """The nearer of the two, beam by beam."""
-        closer = other.ranges < self.ranges
-        pairs = ((self.ranges, other.ranges), (self.cosine, other.cosine), (self.body, other.body))
-        return Hits(*(np.where(closer, theirs, ours) for ours, theirs in pairs))
-
-
-def _segment_ranges(segments: Floats, directions: Floats) -> Floats:
-    """(B, S) ranges at which beams from the origin meet segments (S, 4), else inf; directions: (B, 2)."""
-    a, edge = segments[:, :2], segments[:, 2:] - segments[:, :2]
-    dx, dy = directions[:, :1], directions[:, 1:]
-    with np.errstate(divide="ignore", invalid="ignore"):  # parallel beams divide by zero and fail all comparisons below
-        inverse = 1.0 / (dx * edge[:, 1] - dy * edge[:, 0])
-        ranges = (a[:, 0] * edge[:, 1] - a[:, 1] * edge[:, 0]) * inverse
-        along = (a[:, 0] * dy - a[:, 1] * dx) * inverse
-        return np.where((ranges > 0) & (along >= 0) & (along <= 1), ranges, np.inf)
-
-
-def _circle_ranges(circles: Floats, directions: Floats, rng: np.random.Generator) -> Floats:
-    """(B, C) ranges at which beams meet circles (C, 4); in foliage they end at a random depth, or pass through."""
-    along = directions @ circles[:, :2].T
-    half_squared = circles[:, 2] ** 2 - (circles[:, :2] ** 2).sum(1) + along**2
-    half = np.sqrt(np.maximum(half_squared, 0))
-    ranges = along - half
-    hit = (half_squared > 0) & (ranges > 0)
-    leafy = np.flatnonzero(circles[:, 3] > 0)
-    depth = rng.standard_exponential((len(directions), len(leafy))) * circles[leafy, 3]
-    hit[:, leafy] &= depth < 2 * half[:, leafy]
-    ranges[:, leafy] += depth
-    return np.where(hit, ranges, np.inf)
-
-
-def cast(shapes: Shapes, bearings: Floats, body: int, rng: np.random.Generator) -> Hits:
-    """Casts every beam (B,) from the origin onto shapes in the sensor's frame. O(B (S + C))."""
-    directions = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
-    n_segments, n_shapes = len(shapes.segments), len(shapes.segments) + len(shapes.circles)
-    nothing = np.full((len(bearings), 1), np.inf)
-    ranges = [_segment_ranges(shapes.segments, directions), _circle_ranges(shapes.circles, directions, rng), nothing]
-    table = np.concatenate(ranges, axis=1)  # (B, S + C + 1)
-    nearest = table.argmin(1)
-    reached = table[np.arange(len(bearings)), nearest]
-    nearest[np.isinf(reached)] = n_shapes
-    cosine = np.ones(len(bearings))  # foliage has no orientation
-
-    on = np.flatnonzero(nearest < n_segments)
-    edge = shapes.segments[nearest[on], 2:] - shapes.segments[nearest[on], :2]
-    cross = directions[on, 0] * edge[:, 1] - directions[on, 1] * edge[:, 0]
-    cosine[on] = np.abs(cross) / np.hypot(edge[:, 0], edge[:, 1])
-
-    on = np.flatnonzero((nearest >= n_segments) & (nearest < n_shapes))
-    circle = shapes.circles[nearest[on] - n_segments]
-    on, circle = on[circle[:, 3] == 0], circle[circle[:, 3] == 0]
-    outward = directions[on] * reached[on, None] - circle[:, :2]
-    cosine[on] = np.abs((directions[on] * outward).sum(1)) / circle[:, 2]
-    return Hits(reached, cosine, np.full(len(bearings), body))
-
-
-def _in_view(shapes: Shapes, reach: float, fov: float) -> Shapes:
-    """Culls shapes that no beam can meet, such as most of a long street. shapes: in the sensor's frame."""
-    ends = shapes.segments.reshape(-1, 2, 2)
-    near = np.hypot(*(ends.mean(1)).T) < reach + np.hypot(*(ends[:, 1] - ends[:, 0]).T) / 2
-    near_circles = np.hypot(shapes.circles[:, 0], shapes.circles[:, 1]) < reach + shapes.circles[:, 2]
-    if fov <= 180:
-        near &= ends[:, :, 0].max(1) > 0
-        near_circles &= shapes.circles[:, 0] + shapes.circles[:, 2] > 0
-    return Shapes(shapes.segments[near], shapes.circles[near_circles])
-
-
-# --- the sensor ---------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Capture:
-    """One scan with the state of the simulation.
-
-    Attributes:
-        scan: the valid returns, n of them.
-        body: (n,) their bodies: `STATIC`, a mover's number, or `NO_BODY`.
-        spacing: (n,) metres between neighbouring returns on the surface there.
-        settled: (n, 2) their places in the sensor's frame had all beams been cast at `time`.
-        time: seconds, of the middle of the sweep.
-        ego: (3,) the sensor's pose in the world, at full size.
-        movers: those in the world at this time, visible or not.
-    """
-
-    scan: Scan
-    body: Ints
-    spacing: Floats
-    settled: Floats
-    time: float
-    ego: Floats
-    movers: tuple[Mover, ...]
-
-
-def beam_bearings(config: SimulatorConfig) -> tuple[Floats, float]:
-    """(beams,) bearings of the sensor and the angle between neighbours, radians; a single beam looks ahead."""
-    fov = np.radians(config.fov)
-    step = fov / config.beams if config.fov == 360 else fov / max(config.beams - 1, 1)
-    first = -fov / 2 if config.beams > 1 else 0.0
-    return first + step * np.arange(config.beams), float(step)
-
-
-def _mix_edges(ranges: Floats, body: Ints, config: SimulatorConfig, rng: np.random.Generator) -> tuple[Floats, Ints]:
-    """Mixed pixels: at some depth edges a beam returns a range between both surfaces, which belongs to no body."""
-    with np.errstate(invalid="ignore"):
-        jump = np.diff(ranges)  # inf - inf is nan: no edge
-        is_edge = (np.abs(jump) > MIXED_JUMP[0]) & (np.abs(jump) < MIXED_JUMP[1]) & (rng.random(len(jump)) < config.mixed_pixels)
-    edge = np.flatnonzero(is_edge)
-    far = edge + (jump[edge] > 0)
-    near = ranges[edge + (jump[edge] <= 0)]
-    mixed, bodies = ranges.copy(), body.copy()
-    mixed[far] = near + rng.uniform(0.1, 0.9, len(edge)) * np.abs(jump[edge])
-    bodies[far] = NO_BODY
-    return mixed, bodies
-
-
-def _noise(bearings: Floats, config: SimulatorConfig, rng: np.random.Generator) -> Floats:
-    """(B,) range noise of the beams plus the vibration shared by neighbours, metres."""
-    knots = np.arange(bearings[0] - VIBRATION_KNOTS, bearings[-1] + 2 * VIBRATION_KNOTS, VIBRATION_KNOTS)
-    jolts = np.interp(bearings, knots, rng.normal(0, config.vibration, len(knots)))
-    return rng.normal(0, config.range_noise, len(bearings)) + jolts
-
-
-def _measure(hits: Hits, config: SimulatorConfig, rng: np.random.Generator) -> tuple[Scan, Ints, Ints, Floats]:
-    """The measured scan of `hits`, and beam, body and spacing (n,) of its returns."""
-    bearings, step = beam_bearings(config)
-    ranges, body = _mix_edges(hits.ranges, hits.body, config, rng)
-    ranges = config.scale * ranges + _noise(bearings, config, rng)
-    grazing = np.exp(-hits.cosine / GRAZING_COSINE)
-    lost = rng.random(len(ranges)) < config.dropout + (1 - config.dropout) * grazing
-    keep = np.flatnonzero(~lost & (ranges > config.range_min) & (ranges < config.range_max - MAX_RANGE_MARGIN))
-    limits = {"range_min": config.range_min, "range_max": config.range_max, "range_noise": config.range_noise}
-    limits = limits if config.states_limits else {}
-    scan = Scan.from_ranges(ranges[keep], bearings[keep], **limits)
-    assert len(scan) == len(keep)
-    return scan, keep, body[keep], scan.ranges * step / np.maximum(hits.cosine[keep], LEAST_COSINE)
-
-
-# --- annotation ---------------------------------------------------------------------------------------------------------------
-
-
-def association_gate(spacing: Floats, config: SimulatorConfig) -> float:
-    """Maximum distance of a moved return to its counterpart, metres; spacing: (M,) of the target scan, not empty."""
-    noise = float(np.hypot(config.range_noise, config.vibration))
-    return GATE * (float(np.median(spacing)) / 2 + 2 * noise)
-
-
-def _associate(moved: Floats, seen: Floats, body: Ints, target: Capture, target_body: Ints, config: SimulatorConfig) -> Ints:
-    """(N,) the target return of the same body that was seen nearest, of those truly within the gate, or -1. O(N M).
-
-    Args:
-        moved, seen: (N, 2) the moved source returns, where they were had the sweep taken no time, and as they were measured.
-    """
-    association = np.full(len(moved), OUTLIER)
-    if not len(moved) or not len(target_body):
-        return association
-    is_near = _distances(moved, target.settled) <= association_gate(target.spacing, config)
-    distance = np.where((body[:, None] == target_body) & is_near, _distances(seen, target.scan.points), np.inf)
-    nearest = distance.argmin(1)
-    found = np.isfinite(distance[np.arange(len(moved)), nearest])
-    association[found] = nearest[found]
-    return association
-
-
-def _distances(points: Floats, others: Floats) -> Floats:
-    """(N, M) distances between (N, 2) and (M, 2) points."""
-    offset = points[:, None, :] - others  # (N, M, 2)
-    return np.hypot(offset[..., 0], offset[..., 1])
-
-
-def annotate(source: Capture, target: Capture, config: SimulatorConfig) -> Annotation:
-    """Ground truth of every source return, from the true motions of the sensor and of every body."""
-    table, label = _bodies(source, target, config)
-    body = np.array([label[b] for b in source.body], dtype=np.int64)
-    target_body = np.array([label.get(b, UNSEEN) for b in target.body], dtype=np.int64)
-    motion = table[np.maximum(body, 0)]
-    moved, seen = (se2.rotate(motion[:, 0], points) + motion[:, 1:] for points in (source.settled, source.scan.points))
-    partner = np.where(body < 0, OUTLIER, _associate(moved, seen, body, target, target_body, config))
-    ignore = body == UNKNOWN
-    body = np.where((body < 0) | ((source.body == NO_BODY) & (partner == OUTLIER)), NO_BODY, body)
-    return Annotation(partner, np.where(partner == OUTLIER, OUTLIER, body), table, body, ignore)
-
-
-def _bodies(source: Capture, target: Capture, config: SimulatorConfig) -> tuple[Floats, dict[int, int]]:
-    """(K + 1, 3) motions of the background and of the annotated movers, and the label of every body of the source."""
-    scale = np.array([1.0, config.scale, config.scale])
-    motions = [se2.compose(se2.inverse(target.ego), source.ego) * scale]
-    label = {STATIC: 0, NO_BODY: 0 if config.matches_mixed else NO_BODY}
-    least = config.least_travel * (association_gate(target.spacing, config) if config.least_travel and len(target.spacing) else 0.0)
-    for mover in source.movers:
-        before, after = mover.pose(source.time), mover.pose(target.time)
-        if np.hypot(*(after - before)[1:]) < LEAST_MOTION and abs(se2.wrap(after[0] - before[0])) < LEAST_MOTION:
-            label[mover.number] = 0
-            continue
-        points = source.settled[source.body == mover.number]
-        to_world = se2.compose(after, se2.inverse(before))
-        motion = se2.compose(se2.inverse(target.ego), se2.compose(to_world, source.ego)) * scale
-        travel = np.hypot(*(se2.apply(motion, points) - se2.apply(motions[0], points)).T)
-        if len(points) and travel.max() < least:
-            label[mover.number] = UNKNOWN
-        elif len(points):
-            label[mover.number] = len(motions)
-            motions.append(motion)
-    return np.stack(motions), label
-
-
-# --- sequences ----------------------------------------------------------------------------------------------------------------
 
 
 def _longest_step(config: SimulatorConfig) -> float:
@@ -314,7 +86,7 @@ class _Drive:
             if place not in self.movers:
                 hits = self._enter(place, kind, i, hits)
         movers = tuple(self.movers.values())
-        scan, beam, body, spacing = _measure(hits, config, rng)
+        scan, beam, body, spacing = measure(hits, config, rng)
         self.movers = {place: mover for place, mover in self.movers.items() if (body == mover.number).any()}
         settled = self._settle(scan.points, beam, body, i, movers)
         return Capture(scan, body, spacing, settled, self.times[i], self.path[i], movers)
@@ -340,7 +112,7 @@ class _Drive:
         parts = []
         for beams, late in self._sweep():
             shapes = outlines(self.times[i] + late).moved(se2.inverse(self._pose(i, late)))
-            shapes = _in_view(shapes, reach, self.config.fov) if body == STATIC else shapes
+            shapes = in_view(shapes, reach, self.config.fov) if body == STATIC else shapes
             parts.append(cast(shapes, bearings[beams], body, self.rng))
         return Hits(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("ranges", "cosine", "body")))
 

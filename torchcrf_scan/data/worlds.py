@@ -86,18 +86,21 @@ WORLDS = {
     "still_indoor": SimulatorConfig(scene="indoor", range_max=30.0, ego_translation=0.4, movers_min=0, movers_max=0),
 }
 
-# What recordings have and the worlds above lack: scans that state nothing, little noise but errors that neighbouring beams share (skew,
-# tilt), mixed pixels that lie in line with a surface, and an annotation without what it cannot tell from the background.
-RECORDED = SimulatorConfig(range_noise=0.008, states_limits=False, matches_mixed=True, least_travel=1.0, movers_max=3)
-STREET = replace(RECORDED, ego_translation=3.0, vibration=0.03, litter=0.5)
-INDOOR = replace(RECORDED, scene="indoor", range_max=30.0, dt=0.3, ego_translation=0.4, litter=2.0, vibration=0.015)
-CARS = replace(
-    RECORDED, beams=360, fov=360.0, range_max=9.0, dropout=0.3, scale=0.1, ego_translation=4.0, ego_rotation=0.25, dt=0.24, sweep=0.08,
-    range_noise=0.005, vibration=0.012, aperture=0.2,
-)
-STILL = {"movers_min": 0, "movers_max": 0}
+# What recordings have and the worlds above lack: scans that state nothing; little noise, but errors that neighbouring beams share
+# (skew, tilt); mixed pixels in line with a surface; an annotation without what it cannot tell from the background.
+AS_RECORDED = SimulatorConfig(range_noise=0.008, states_limits=False, matches_mixed=True, least_travel=1.0, movers_max=3)
+STREET = replace(AS_RECORDED, ego_translation=3.0, vibration=0.03, litter=0.5)
+INDOOR = replace(AS_RECORDED, scene="indoor", range_max=30.0, dt=0.3, ego_translation=0.4, litter=2.0, vibration=0.015)
+SMALL = replace(AS_RECORDED, scale=0.1, range_max=9.0, dropout=0.3, dt=0.24, ego_translation=4.0, ego_rotation=0.25, aperture=0.2)
+CARS = replace(SMALL, beams=360, fov=360.0, range_noise=0.005, vibration=0.012, sweep=0.08)
 
-RECORDED_WORLDS = {  # named by scene and beams
+
+def without_movers(config: SimulatorConfig) -> SimulatorConfig:
+    """The same world, in which nothing moves."""
+    return replace(config, movers_min=0, movers_max=0)
+
+
+TRAINING_WORLDS = {  # named by scene and beams
     "street_16": replace(STREET, beams=16, fov=120.0, range_max=60.0),
     "street_64": replace(STREET, beams=64, fov=90.0, range_noise=0.02, sweep=0.05),
     "street_181": replace(STREET, beams=181, range_noise=0.02, sweep=0.013, matches_mixed=False),
@@ -113,10 +116,10 @@ RECORDED_WORLDS = {  # named by scene and beams
     "crowd_768": replace(INDOOR, beams=768, fov=270.0, movers_min=2, movers_max=6, vibration=0.005, ego_translation=0.1),
     "cars_360": CARS,
     "cars_240": replace(CARS, beams=240, fov=240.0, range_noise=0.01, sweep=0.1),
-    "still_street_361": replace(STREET, sweep=0.05, **STILL),
-    "still_cars_360": replace(CARS, **STILL),
-    "still_indoor_180": replace(INDOOR, beams=180, range_noise=0.015, sweep=0.013, **STILL),
-    "still_indoor_360": replace(INDOOR, beams=360, sweep=0.013, **STILL),
-    "still_indoor_512": replace(INDOOR, beams=512, fov=240.0, range_max=10.0, sweep=0.1, **STILL),
+    "still_street_361": without_movers(replace(STREET, sweep=0.05)),
+    "still_cars_360": without_movers(CARS),
+    "still_indoor_180": without_movers(replace(INDOOR, beams=180, range_noise=0.015, sweep=0.013)),
+    "still_indoor_360": without_movers(replace(INDOOR, beams=360, sweep=0.013)),
+    "still_indoor_512": without_movers(replace(INDOOR, beams=512, fov=240.0, range_max=10.0, sweep=0.1)),
 }
-NAMED_WORLDS = WORLDS | RECORDED_WORLDS
+NAMED_WORLDS = WORLDS | TRAINING_WORLDS

@@ -185,8 +185,8 @@ class DataConfig:
     Attributes:
         train: a file, folder or glob pattern of training pairs, or a list of them.
         test: the same for test pairs.
-        simulate_train: names of simulated `NAMED_WORLDS` to train on too, `pairs` pairs each. For other worlds, `torchcrf-scan simulate`
-            writes files.
+        simulate_train: names of simulated `NAMED_WORLDS` to train on too, `pairs` pairs each. For other worlds,
+            `torchcrf-scan simulate` writes files.
         simulate_test: names of simulated `NAMED_WORLDS` to test on too; train and test never share a seed.
         pairs: pairs of every simulated world.
         sequences: sequences of every simulated world.
