@@ -91,7 +91,7 @@ WORLDS = {
 AS_RECORDED = SimulatorConfig(range_noise=0.008, states_limits=False, matches_mixed=True, least_travel=1.0, movers_max=3)
 STREET = replace(AS_RECORDED, ego_translation=3.0, vibration=0.03, litter=0.5)
 INDOOR = replace(AS_RECORDED, scene="indoor", range_max=30.0, dt=0.3, ego_translation=0.4, litter=2.0, vibration=0.015)
-SMALL = replace(AS_RECORDED, scale=0.1, range_max=9.0, dropout=0.3, dt=0.24, ego_translation=4.0, ego_rotation=0.25, aperture=0.2)
+SMALL = replace(AS_RECORDED, scale=0.1, range_max=9.0, dropout=0.3, dt=0.4, ego_translation=4.0, ego_rotation=0.25, aperture=0.2)
 CARS = replace(SMALL, beams=360, fov=360.0, range_noise=0.005, vibration=0.012, sweep=0.08)
 
 
