@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchcrf_scan.data import simulate, world
-from torchcrf_scan.data.simulate import cast, simulate_pairs
+from torchcrf_scan.data import annotate, laser, simulate, world
+from torchcrf_scan.data.laser import cast
+from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.world import Mover, Shapes
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
@@ -58,10 +59,10 @@ def check_annotation(pair: ScanPair, config: SimulatorConfig) -> None:
     motion = a.motions[a.body[has_partner]]
     moved = se2.rotate(motion[:, 0], source.points[has_partner]) + motion[:, 1:]
     gap = np.hypot(*(moved - target.points[a.association[has_partner]]).T)
-    _, step = simulate.beam_bearings(config)
+    _, step = laser.beam_bearings(config)
     if len(target):
-        widest = target.ranges * step / simulate.LEAST_COSINE
-        assert (gap <= simulate.association_gate(widest, config) + 1e-12).all()
+        widest = target.ranges * step / laser.LEAST_COSINE
+        assert (gap <= annotate.association_gate(widest, config) + 1e-12).all()
 
 
 def test_same_seed_same_bytes():
@@ -112,7 +113,7 @@ def test_movers_move_relative_to_the_world(drives):
         for k, motion in enumerate(movers, 1):
             points = pair.source.points[pair.annotation.body == k]
             shift = np.hypot(*(se2.apply(motion, points) - se2.apply(background, points)).T)
-            assert shift.max() > 0.5 * simulate.LEAST_MOTION
+            assert shift.max() > 0.5 * annotate.LEAST_MOTION
             assert shift.max() < 16.5 * 0.2 + 0.5  # no car is faster than 15 m/s; far points also turn
 
 

@@ -68,6 +68,16 @@ def test_clusters_are_judged_by_what_they_explain() -> None:
     assert terms[:, 1].tolist() == [1.0, -1.0]
 
 
+def test_a_mover_of_whom_nothing_is_annotated_is_not_judged() -> None:
+    batch = annotated()
+    assert batch.truth is not None
+    known = (torch.arange(N) < 8) | (torch.arange(N) >= 16)
+    batch = replace(batch, truth=replace(batch.truth, known=known[None]))
+    terms, label = judge_clusters(JointScanCRF().double(), Material(batch, start_of(batch), 0, ()))
+    assert label.tolist() == [0]
+    assert terms[:, 1].tolist() == [-1.0]
+
+
 def test_the_potential_tells_true_movers_from_others(monkeypatch: pytest.MonkeyPatch) -> None:
     label = torch.arange(40) % 2
     terms = torch.stack([label + 0.3 * normal(40, seed=1), 2 * label - 1 + 0.5 * normal(40, seed=2)], dim=-1)

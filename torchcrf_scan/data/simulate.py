@@ -5,229 +5,29 @@ Worlds, poses and ray casting are at full size; `SimulatorConfig.scale` is appli
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
-from torchcrf_scan.data.world import Mover, Shapes, Viewer, World, draw_mover, indoor, street
+from torchcrf_scan.data.annotate import STATIC, Capture, annotate
+from torchcrf_scan.data.laser import NO_BODY, Hits, beam_bearings, cast, in_view, measure
+from torchcrf_scan.data.world import Mover, Shapes, Viewer, World, draw_mover, indoor, littered, street
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.scan import MAX_RANGE_MARGIN, OUTLIER, Annotation, Bools, Floats, Ints, Scan, ScanPair
+from torchcrf_scan.scan import Bools, Floats, Ints, ScanPair
 
 ORIGIN = "torchcrf_scan simulator"
-STATIC = 0  # bodies in a scan: the static world, movers by number, and returns of no single body
-NO_BODY = -1
 
 FARTHEST_WORLD = {"street": 90.0, "indoor": 25.0}  # metres of world ahead of the sensor
 TURNING_RADIUS = 4.5  # metres, minimum of a car; robots turn on the spot
 INDOOR_SPEED = 1.5  # m/s, the fastest robot
-VIBRATION_KNOTS = np.radians(8.0)  # angle over which neighbouring beams share a jolt
-MIXED_JUMP = (0.3, 6.0)  # metres at full size; ranges this far apart merge in one beam; farther ones give two separate echoes
-GRAZING_COSINE = 0.03  # loss of grazing beams: exp(-cosine / this)
-LEAST_COSINE = 0.1  # the spacing of returns on a surface is limited to ten times that at normal incidence
-GATE = 3.2  # times half the scan's usual spacing plus twice its noise; annotators of recordings use one gate for a whole scan
-LEAST_MOTION = 0.02  # metres at full size; bodies that move less within a pair are static
 SENSOR_CLEARANCE = 0.3  # metres between movers and the sensor
+SWEEP_PARTS = 24  # groups of beams that are cast at the same time, while a sensor sweeps
 LEAST_SEEN = 3  # minimum number of returns of a mover when it enters
 ENTRY_TRIES = {"any": 12, "truck": 80, "slider": 40}
 TRUCK_SHARE = (0.4, 0.5)  # of the returns
-
-
-# --- casting ------------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Hits:
-    """The first hit of every beam, at full size: (B,) `ranges` (inf: none), `cosine` of incidence, and `body`."""
-
-    ranges: Floats
-    cosine: Floats
-    body: Ints
-
-    def nearer(self, other: Hits) -> Hits:
-        """The nearer of the two, beam by beam."""
-        closer = other.ranges < self.ranges
-        pairs = ((self.ranges, other.ranges), (self.cosine, other.cosine), (self.body, other.body))
-        return Hits(*(np.where(closer, theirs, ours) for ours, theirs in pairs))
-
-
-def _segment_ranges(segments: Floats, directions: Floats) -> Floats:
-    """(B, S) ranges at which beams from the origin meet segments (S, 4), else inf; directions: (B, 2)."""
-    a, edge = segments[:, :2], segments[:, 2:] - segments[:, :2]
-    dx, dy = directions[:, :1], directions[:, 1:]
-    with np.errstate(divide="ignore", invalid="ignore"):  # parallel beams divide by zero and fail all comparisons below
-        inverse = 1.0 / (dx * edge[:, 1] - dy * edge[:, 0])
-        ranges = (a[:, 0] * edge[:, 1] - a[:, 1] * edge[:, 0]) * inverse
-        along = (a[:, 0] * dy - a[:, 1] * dx) * inverse
-        return np.where((ranges > 0) & (along >= 0) & (along <= 1), ranges, np.inf)
-
-
-def _circle_ranges(circles: Floats, directions: Floats, rng: np.random.Generator) -> Floats:
-    """(B, C) ranges at which beams meet circles (C, 4); in foliage they end at a random depth, or pass through."""
-    along = directions @ circles[:, :2].T
-    half_squared = circles[:, 2] ** 2 - (circles[:, :2] ** 2).sum(1) + along**2
-    half = np.sqrt(np.maximum(half_squared, 0))
-    ranges = along - half
-    hit = (half_squared > 0) & (ranges > 0)
-    leafy = np.flatnonzero(circles[:, 3] > 0)
-    depth = rng.standard_exponential((len(directions), len(leafy))) * circles[leafy, 3]
-    hit[:, leafy] &= depth < 2 * half[:, leafy]
-    ranges[:, leafy] += depth
-    return np.where(hit, ranges, np.inf)
-
-
-def cast(shapes: Shapes, bearings: Floats, body: int, rng: np.random.Generator) -> Hits:
-    """Casts every beam (B,) from the origin onto shapes in the sensor's frame. O(B (S + C))."""
-    directions = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
-    n_segments, n_shapes = len(shapes.segments), len(shapes.segments) + len(shapes.circles)
-    nothing = np.full((len(bearings), 1), np.inf)
-    ranges = [_segment_ranges(shapes.segments, directions), _circle_ranges(shapes.circles, directions, rng), nothing]
-    table = np.concatenate(ranges, axis=1)  # (B, S + C + 1)
-    nearest = table.argmin(1)
-    reached = table[np.arange(len(bearings)), nearest]
-    nearest[np.isinf(reached)] = n_shapes
-    cosine = np.ones(len(bearings))  # foliage has no orientation
-
-    on = np.flatnonzero(nearest < n_segments)
-    edge = shapes.segments[nearest[on], 2:] - shapes.segments[nearest[on], :2]
-    cross = directions[on, 0] * edge[:, 1] - directions[on, 1] * edge[:, 0]
-    cosine[on] = np.abs(cross) / np.hypot(edge[:, 0], edge[:, 1])
-
-    on = np.flatnonzero((nearest >= n_segments) & (nearest < n_shapes))
-    circle = shapes.circles[nearest[on] - n_segments]
-    on, circle = on[circle[:, 3] == 0], circle[circle[:, 3] == 0]
-    outward = directions[on] * reached[on, None] - circle[:, :2]
-    cosine[on] = np.abs((directions[on] * outward).sum(1)) / circle[:, 2]
-    return Hits(reached, cosine, np.full(len(bearings), body))
-
-
-def _in_view(shapes: Shapes, reach: float, fov: float) -> Shapes:
-    """Culls shapes that no beam can meet, such as most of a long street. shapes: in the sensor's frame."""
-    ends = shapes.segments.reshape(-1, 2, 2)
-    near = np.hypot(*(ends.mean(1)).T) < reach + np.hypot(*(ends[:, 1] - ends[:, 0]).T) / 2
-    near_circles = np.hypot(shapes.circles[:, 0], shapes.circles[:, 1]) < reach + shapes.circles[:, 2]
-    if fov <= 180:
-        near &= ends[:, :, 0].max(1) > 0
-        near_circles &= shapes.circles[:, 0] + shapes.circles[:, 2] > 0
-    return Shapes(shapes.segments[near], shapes.circles[near_circles])
-
-
-# --- the sensor ---------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Capture:
-    """One scan with the state of the simulation.
-
-    Attributes:
-        scan: the valid returns, n of them.
-        body: (n,) their bodies: `STATIC`, a mover's number, or `NO_BODY`.
-        spacing: (n,) metres between neighbouring returns on the surface there.
-        time: seconds.
-        ego: (3,) the sensor's pose in the world, at full size.
-        movers: those in the world at this time, visible or not.
-    """
-
-    scan: Scan
-    body: Ints
-    spacing: Floats
-    time: float
-    ego: Floats
-    movers: tuple[Mover, ...]
-
-
-def beam_bearings(config: SimulatorConfig) -> tuple[Floats, float]:
-    """(beams,) bearings of the sensor and the angle between neighbours, radians; a single beam looks ahead."""
-    fov = np.radians(config.fov)
-    step = fov / config.beams if config.fov == 360 else fov / max(config.beams - 1, 1)
-    first = -fov / 2 if config.beams > 1 else 0.0
-    return first + step * np.arange(config.beams), float(step)
-
-
-def _mix_edges(ranges: Floats, body: Ints, config: SimulatorConfig, rng: np.random.Generator) -> tuple[Floats, Ints]:
-    """Mixed pixels: at some depth edges a beam returns a range between both surfaces, which belongs to no body."""
-    with np.errstate(invalid="ignore"):
-        jump = np.diff(ranges)  # inf - inf is nan: no edge
-        is_edge = (np.abs(jump) > MIXED_JUMP[0]) & (np.abs(jump) < MIXED_JUMP[1]) & (rng.random(len(jump)) < config.mixed_pixels)
-    edge = np.flatnonzero(is_edge)
-    far = edge + (jump[edge] > 0)
-    near = ranges[edge + (jump[edge] <= 0)]
-    mixed, bodies = ranges.copy(), body.copy()
-    mixed[far] = near + rng.uniform(0.1, 0.9, len(edge)) * np.abs(jump[edge])
-    bodies[far] = NO_BODY
-    return mixed, bodies
-
-
-def _noise(bearings: Floats, config: SimulatorConfig, rng: np.random.Generator) -> Floats:
-    """(B,) range noise of the beams plus the vibration shared by neighbours, metres."""
-    knots = np.arange(bearings[0] - VIBRATION_KNOTS, bearings[-1] + 2 * VIBRATION_KNOTS, VIBRATION_KNOTS)
-    jolts = np.interp(bearings, knots, rng.normal(0, config.vibration, len(knots)))
-    return rng.normal(0, config.range_noise, len(bearings)) + jolts
-
-
-def _measure(hits: Hits, config: SimulatorConfig, rng: np.random.Generator) -> tuple[Scan, Ints, Floats]:
-    """The measured scan of `hits`, and body and spacing (n,) of its returns."""
-    bearings, step = beam_bearings(config)
-    ranges, body = _mix_edges(hits.ranges, hits.body, config, rng)
-    ranges = config.scale * ranges + _noise(bearings, config, rng)
-    grazing = np.exp(-hits.cosine / GRAZING_COSINE)
-    lost = rng.random(len(ranges)) < config.dropout + (1 - config.dropout) * grazing
-    keep = np.flatnonzero(~lost & (ranges > config.range_min) & (ranges < config.range_max - MAX_RANGE_MARGIN))
-    limits = {"range_min": config.range_min, "range_max": config.range_max, "range_noise": config.range_noise}
-    scan = Scan.from_ranges(ranges[keep], bearings[keep], **limits)
-    assert len(scan) == len(keep)
-    return scan, body[keep], scan.ranges * step / np.maximum(hits.cosine[keep], LEAST_COSINE)
-
-
-# --- annotation ---------------------------------------------------------------------------------------------------------------
-
-
-def association_gate(spacing: Floats, config: SimulatorConfig) -> float:
-    """Maximum distance of a moved return to its counterpart, metres; spacing: (M,) of the target scan, not empty."""
-    noise = float(np.hypot(config.range_noise, config.vibration))
-    return GATE * (float(np.median(spacing)) / 2 + 2 * noise)
-
-
-def _associate(moved: Floats, body: Ints, target: Capture, target_body: Ints, config: SimulatorConfig) -> Ints:
-    """(N,) the nearest target return of the same body within the gate, or -1. moved: (N, 2). O(N M)."""
-    association = np.full(len(moved), OUTLIER)
-    if not len(moved) or not len(target_body):
-        return association
-    offset = moved[:, None, :] - target.scan.points  # (N, M, 2)
-    distance = np.hypot(offset[..., 0], offset[..., 1])
-    is_candidate = (body[:, None] == target_body) & (distance <= association_gate(target.spacing, config))
-    distance[~is_candidate] = np.inf
-    nearest = distance.argmin(1)
-    found = np.isfinite(distance[np.arange(len(moved)), nearest])
-    association[found] = nearest[found]
-    return association
-
-
-def annotate(source: Capture, target: Capture, config: SimulatorConfig) -> Annotation:
-    """Ground truth of every source return, from the true motions of the sensor and of every body."""
-    world = se2.compose(se2.inverse(target.ego), source.ego)
-    motions = [world]
-    label = {STATIC: 0, NO_BODY: -1}
-    for mover in source.movers:
-        before, after = mover.pose(source.time), mover.pose(target.time)
-        if np.hypot(*(after - before)[1:]) < LEAST_MOTION and abs(se2.wrap(after[0] - before[0])) < LEAST_MOTION:
-            label[mover.number] = 0
-        elif (source.body == mover.number).any():
-            label[mover.number] = len(motions)
-            to_world = se2.compose(after, se2.inverse(before))
-            motions.append(se2.compose(se2.inverse(target.ego), se2.compose(to_world, source.ego)))
-    unseen = -2  # a body of the target that is not visible in the source
-    body = np.array([label[b] for b in source.body], dtype=np.int64)
-    target_body = np.array([label.get(b, unseen) for b in target.body], dtype=np.int64)
-    table = np.stack(motions) * np.array([1.0, config.scale, config.scale])
-    points = source.scan.points
-    moved = se2.rotate(table[body, 0], points) + table[body, 1:]
-    partner = np.where(body == NO_BODY, OUTLIER, _associate(moved, body, target, target_body, config))
-    return Annotation(partner, np.where(partner == OUTLIER, OUTLIER, body), table, body, np.zeros(len(body), dtype=bool))
-
-
-# --- sequences ----------------------------------------------------------------------------------------------------------------
 
 
 def _longest_step(config: SimulatorConfig) -> float:
@@ -279,23 +79,55 @@ class _Drive:
     def capture(self, i: int) -> Capture:
         """The scan at time i; movers that were not visible in the scan before (all, at first) are replaced by new ones."""
         config, rng = self.config, self.rng
-        bearings, _ = beam_bearings(config)
-        reach = config.range_max / config.scale
-        static = _in_view(self.world.shapes.moved(se2.inverse(self.path[i])), reach, config.fov)
-        hits = cast(static, bearings, STATIC, rng)
+        hits = self._cast(lambda _: self.world.shapes, STATIC, i)
         for mover in self.movers.values():
-            hits = hits.nearer(self._cast_mover(mover, i))
+            hits = hits.nearer(self._cast(mover.at, mover.number, i))
         for place, kind in enumerate(self.kinds):
             if place not in self.movers:
                 hits = self._enter(place, kind, i, hits)
         movers = tuple(self.movers.values())
-        scan, body, spacing = _measure(hits, config, rng)
+        scan, beam, body, spacing = measure(hits, config, rng)
         self.movers = {place: mover for place, mover in self.movers.items() if (body == mover.number).any()}
-        return Capture(scan, body, spacing, self.times[i], self.path[i], movers)
+        settled = self._settle(scan.points, beam, body, i, movers)
+        return Capture(scan, body, spacing, settled, self.times[i], self.path[i], movers)
 
-    def _cast_mover(self, mover: Mover, i: int) -> Hits:
-        shapes = mover.at(self.times[i]).moved(se2.inverse(self.path[i]))
-        return cast(shapes, beam_bearings(self.config)[0], mover.number, self.rng)
+    def _sweep(self) -> list[tuple[slice, float]]:
+        """The beams that are cast together, and the seconds from the middle of the sweep to their time."""
+        if self.config.sweep == 0:
+            return [(slice(0, self.config.beams), 0.0)]
+        edges = np.linspace(0, self.config.beams, SWEEP_PARTS + 1).round().astype(int)
+        return [(slice(a, b), self.config.sweep * ((a + b) / (2 * self.config.beams) - 0.5)) for a, b in pairwise(edges) if a < b]
+
+    def _pose(self, i: int, late: float) -> Floats:
+        """(3,) the sensor's pose `late` seconds after time i, at the speed of the step from there (of the last, at the end)."""
+        if late == 0:
+            pose: Floats = self.path[i]
+            return pose
+        step = min(i, len(self.times) - 2)
+        return se2.compose(self.path[i], late / self.config.dt * se2.compose(se2.inverse(self.path[step]), self.path[step + 1]))
+
+    def _cast(self, outlines: Callable[[float], Shapes], body: int, i: int) -> Hits:
+        """The hits of all beams on the outlines that a body has at a time, seconds."""
+        bearings, reach = beam_bearings(self.config)[0], self.config.range_max / self.config.scale
+        parts = []
+        for beams, late in self._sweep():
+            shapes = outlines(self.times[i] + late).moved(se2.inverse(self._pose(i, late)))
+            shapes = in_view(shapes, reach, self.config.fov) if body == STATIC else shapes
+            parts.append(cast(shapes, bearings[beams], body, self.rng))
+        return Hits(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("ranges", "cosine", "body")))
+
+    def _settle(self, points: Floats, beam: Ints, body: Ints, i: int, movers: tuple[Mover, ...]) -> Floats:
+        """(n, 2) the returns (n, 2) where their bodies would have been seen, had all beams been cast at time i."""
+        settled, now = points.copy(), self.times[i]
+        for beams, late in self._sweep() if self.config.sweep > 0 else []:
+            in_part = (beam >= beams.start) & (beam < beams.stop)
+            carried = [(STATIC, np.zeros(3)), (NO_BODY, np.zeros(3))]
+            carried += [(m.number, se2.compose(m.pose(now), se2.inverse(m.pose(now + late)))) for m in movers]
+            for number, carry in carried:
+                on = in_part & (body == number)
+                motion = se2.compose(se2.inverse(self.path[i]), se2.compose(carry, self._pose(i, late)))
+                settled[on] = se2.apply(motion * np.array([1.0, self.config.scale, self.config.scale]), points[on])
+        return settled
 
     def _enter(self, place: int, kind: str, i: int, hits: Hits) -> Hits:
         """Places a new mover, if one of a few random ones is visible and unobstructed; returns the new hits."""
@@ -307,7 +139,7 @@ class _Drive:
             mover = draw_mover(self.rng, self.world, viewer, self.born + 1, float(self.times[i]), kind)
             if not _is_clear(mover, obstacles, self.times[i:]):
                 continue
-            seen = hits.nearer(self._cast_mover(mover, i))
+            seen = hits.nearer(self._cast(mover.at, mover.number, i))
             if self._is_seen(seen, mover.number, kind):
                 self.movers[place] = mover
                 self.born += 1
@@ -343,7 +175,9 @@ def _simulate_sequence(config: SimulatorConfig, pairs: int, rng: np.random.Gener
     kinds = (special + ["any"] * max(n_movers - len(special), 0))[: config.movers_max]
     beyond = min(config.range_max / config.scale, FARTHEST_WORLD[config.scene]) * rng.uniform(0.4, 1.0)
     build = street if config.scene == "street" else indoor
-    world = build(rng, -beyond if config.fov > 180 else -20.0, pairs * _longest_step(config) + beyond, config.clutter)
+    start, end = -beyond if config.fov > 180 else -20.0, pairs * _longest_step(config) + beyond
+    world = build(rng, start, end, config.clutter)
+    world = littered(rng, world, start, end, config.litter) if config.litter > 0 else world
     path = _ego_path(config, world, pairs, "truck" in kinds, rng)
     drive = _Drive(config, rng, world, path, config.dt * np.arange(pairs + 1, dtype=np.float64), kinds)
     return [drive.capture(i) for i in range(pairs + 1)]

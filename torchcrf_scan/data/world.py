@@ -6,7 +6,7 @@ A world is built along its x axis, which the sensor follows; `simulate.py` scans
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -234,6 +234,26 @@ def indoor(rng: np.random.Generator, start: float, end: float, clutter: float) -
     ends = [np.array([[x, -12.0, x, 12.0]]) for x in (start, end)]
     shapes = Shapes.of([*(s.segments for s in parts), *ends], [s.circles for s in parts])
     return World(shapes, False, half_width, 0.0, 0.7 * half_width)
+
+
+# --- loose things -------------------------------------------------------------------------------------------------------------
+
+
+def _bystander(rng: np.random.Generator, x: float, y: float) -> Shapes:
+    """The two legs of a person who stands at (x, y)."""
+    theta, apart, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.08, 0.18), rng.uniform(0.05, 0.09)
+    aside = apart * np.array([np.cos(theta), np.sin(theta)])
+    return Shapes.of((), [disc(x + aside[0], y + aside[1], radius), disc(x - aside[0], y - aside[1], radius)])
+
+
+def littered(rng: np.random.Generator, world: World, start: float, end: float, litter: float) -> World:
+    """The world with `litter` loose things on each ten metres from x = start to end, beside the sensor's way."""
+    near, far = (world.half_width + 0.3, world.half_width + 5.0) if world.is_street else (0.5 * world.half_width, world.half_width)
+    parts = [world.shapes]
+    for _ in range(int(rng.poisson(litter * (end - start) / 10))):
+        place = rng.uniform(start, end), rng.choice([-1.0, 1.0]) * rng.uniform(near, far)
+        parts.append((_furniture if rng.random() < 0.6 else _bystander)(rng, *place))
+    return replace(world, shapes=Shapes.of([s.segments for s in parts], [s.circles for s in parts]))
 
 
 # --- movers -------------------------------------------------------------------------------------------------------------------

@@ -32,6 +32,13 @@ class SimulatorConfig:
         dominant_mover: probability that a truck drives beside the sensor and fills 40 to 50 % of the returns of a sequence.
         aperture: probability that a car is seen along one side only and slides along it.
         scale: factor on the whole world and on every motion, but not on the sensor; 0.1 imitates 1:10 model cars.
+        sweep: seconds from the first to the last beam of a scan, while the sensor and the movers move on; 0: all at once.
+        litter: loose things (boxes, chairs, plants, people who stand) on each ten metres beside the sensor's way.
+        states_limits: scans state their range limits and their noise; recordings often do not.
+        matches_mixed: a return of no single surface may have a counterpart in the background, as who annotates a recording cannot
+            tell it from others; otherwise it is an outlier always.
+        least_travel: movers that travel less than this within a pair, in units of the association gate, are left out of the
+            annotation (`ignore`), for they can be told from the background no better than the annotation's own tolerance.
     """
 
     scene: Annotated[str, OneOf("street", "indoor")] = "street"
@@ -52,6 +59,11 @@ class SimulatorConfig:
     dominant_mover: Share = 0.0
     aperture: Share = 0.0
     scale: Positive = 1.0
+    sweep: Amount = 0.0
+    litter: Amount = 0.0
+    states_limits: bool = True
+    matches_mixed: bool = False
+    least_travel: Amount = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -73,3 +85,41 @@ WORLDS = {
     "still_street": SimulatorConfig(movers_min=0, movers_max=0),
     "still_indoor": SimulatorConfig(scene="indoor", range_max=30.0, ego_translation=0.4, movers_min=0, movers_max=0),
 }
+
+# What recordings have and the worlds above lack: scans that state nothing; little noise, but errors that neighbouring beams share
+# (skew, tilt); mixed pixels in line with a surface; an annotation without what it cannot tell from the background.
+AS_RECORDED = SimulatorConfig(range_noise=0.008, states_limits=False, matches_mixed=True, least_travel=1.0, movers_max=3)
+STREET = replace(AS_RECORDED, ego_translation=3.0, vibration=0.03, litter=0.5)
+INDOOR = replace(AS_RECORDED, scene="indoor", range_max=30.0, dt=0.3, ego_translation=0.4, litter=2.0, vibration=0.015)
+SMALL = replace(AS_RECORDED, scale=0.1, range_max=9.0, dropout=0.3, dt=0.4, ego_translation=4.0, ego_rotation=0.25, aperture=0.2)
+CARS = replace(SMALL, beams=360, fov=360.0, range_noise=0.005, vibration=0.012, sweep=0.08)
+
+
+def without_movers(config: SimulatorConfig) -> SimulatorConfig:
+    """The same world, in which nothing moves."""
+    return replace(config, movers_min=0, movers_max=0)
+
+
+TRAINING_WORLDS = {  # named by scene and beams
+    "street_16": replace(STREET, beams=16, fov=120.0, range_max=60.0),
+    "street_64": replace(STREET, beams=64, fov=90.0, range_noise=0.02, sweep=0.05),
+    "street_181": replace(STREET, beams=181, range_noise=0.02, sweep=0.013, matches_mixed=False),
+    "street_361": replace(STREET, sweep=0.05, matches_mixed=False),
+    "street_541": replace(STREET, beams=541, fov=270.0, range_max=50.0, sweep=0.02),
+    "street_1441": replace(STREET, beams=1441, fov=360.0, sweep=0.08, movers_max=6),
+    "truck_361": replace(STREET, matches_mixed=False, dominant_mover=0.1, aperture=0.1),
+    "indoor_32": replace(INDOOR, beams=32, fov=360.0, range_max=12.0, range_noise=0.02, sweep=0.1),
+    "indoor_128": replace(INDOOR, beams=128, fov=90.0, range_max=8.0, range_noise=0.02),
+    "indoor_360": replace(INDOOR, beams=360, fov=360.0, range_max=8.0, dropout=0.15, sweep=0.16),
+    "indoor_512": replace(INDOOR, beams=512, fov=240.0, range_max=10.0, vibration=0.005, sweep=0.07, movers_max=5),
+    "indoor_1081": replace(INDOOR, beams=1081, fov=270.0, vibration=0.005, sweep=0.019, movers_max=5),
+    "crowd_768": replace(INDOOR, beams=768, fov=270.0, movers_min=2, movers_max=6, vibration=0.005, ego_translation=0.1),
+    "cars_360": CARS,
+    "cars_240": replace(CARS, beams=240, fov=240.0, range_noise=0.01, sweep=0.1),
+    "still_street_361": without_movers(replace(STREET, sweep=0.05)),
+    "still_cars_360": without_movers(CARS),
+    "still_indoor_180": without_movers(replace(INDOOR, beams=180, range_noise=0.015, sweep=0.013)),
+    "still_indoor_360": without_movers(replace(INDOOR, beams=360, sweep=0.013)),
+    "still_indoor_512": without_movers(replace(INDOOR, beams=512, fov=240.0, range_max=10.0, sweep=0.1)),
+}
+NAMED_WORLDS = WORLDS | TRAINING_WORLDS

@@ -15,7 +15,7 @@ import numpy as np
 from torchcrf_scan.baselines.register import BASELINES, installed
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.data.worlds import NAMED_WORLDS
 from torchcrf_scan.evaluation.bootstrap import by_blocks, by_sequence
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import Scores, Table, differences_table, report
@@ -149,7 +149,7 @@ def load_pairs(config: RunConfig) -> tuple[list[ScanPair], int]:
 def simulate(worlds: Sequence[str], config: RunConfig, seed: int) -> list[ScanPair]:
     """Pairs of every named world, with the world's number in their names."""
     data = config.data
-    found = [simulate_pairs(WORLDS[world], data.pairs, data.sequences, seed + k) for k, world in enumerate(worlds)]
+    found = [simulate_pairs(NAMED_WORLDS[world], data.pairs, data.sequences, seed + k) for k, world in enumerate(worlds)]
     return [replace(pair, name=f"{seed + k}_{pair.name}") for k, of_world in enumerate(found) for pair in of_world]
 
 

@@ -16,8 +16,8 @@ class ExperimentConfig:
 
     Attributes:
         pairs: a file, folder or glob pattern of the annotated pairs, or a list of them; none: the simulated `worlds`.
-        worlds: names of simulated `WORLDS`, `data.pairs` pairs each, if no files are given.
-        also_train: names of simulated `WORLDS` that every fold trains on too, `data.pairs` pairs each.
+        worlds: names of simulated `NAMED_WORLDS`, `data.pairs` pairs each, if no files are given.
+        also_train: names of simulated `NAMED_WORLDS` that every fold trains on too, `data.pairs` pairs each.
         protocols: `leave_one_pair_out` (the paper's; consecutive pairs share a scan, so it leaks) and `leave_one_sequence_out`.
         joint_alone: of all the methods, only the joint model (for ablations).
         test_every: test only every so-many-th pair, for models that are slow to decode.

@@ -41,7 +41,10 @@ def fit_potential(model: JointScanCRF, material: Sequence[Material]) -> ClusterP
 
 
 def judge_clusters(model: JointScanCRF, part: Material) -> tuple[Tensor, Tensor]:
-    """The potential's terms (P, 2) of all movers considered in a batch, and (P,) 1 if the cluster is a true mover's, else 0."""
+    """The potential's terms (P, 2) of the movers considered in a batch, and (P,) 1 if the cluster is a true mover's, else 0.
+
+    A cluster with points of which none is annotated is left out: nobody knows what it is.
+    """
     view = model.view(part.batch, model.learned_inputs(part.batch, part.start))
     start = view.in_unit(part.start).considered()
     parameters, config = model.fitted, model.config.inference
@@ -49,8 +52,9 @@ def judge_clusters(model: JointScanCRF, part: Material) -> tuple[Tensor, Tensor]
     assert start.log_odds is not None
     terms = ClusterPotential.terms(evidence(view, start, state, parameters, config), start.log_odds)
     found = find_candidates(view, state.motions.value, state.motions.active, config)
-    label = is_true_mover(view, start, joint.update_clusters(view, start, state, found, parameters, config).cluster)
-    considered = start.active.clone()
+    cluster = joint.update_clusters(view, start, state, found, parameters, config).cluster
+    label = is_true_mover(view, start, cluster)
+    considered = start.active & ~is_unknown(view, start, cluster)
     considered[:, 0] = False
     return terms[considered], label[considered].long()
 
@@ -66,3 +70,12 @@ def is_true_mover(view: PairView, start: Start, cluster: Tensor) -> Tensor:
     is_pure = most > PURE * (own * truth.known[..., None]).sum(1)
     is_first = most >= shared.amax(1).gather(1, which)
     return is_pure & is_first & (most > 0)
+
+
+def is_unknown(view: PairView, start: Start, cluster: Tensor) -> Tensor:
+    """(B, C) whether a cluster has points, but none that are annotated. cluster: (B, N)."""
+    truth = view.batch.truth
+    assert truth is not None
+    own = torch.nn.functional.one_hot(cluster.clamp(min=0), start.motions.shape[1]) * (cluster >= 0)[..., None]  # (B, N, C)
+    has_known: Tensor = (own * truth.known[..., None]).any(1)
+    return own.any(1) & ~has_known

@@ -8,12 +8,12 @@ from typing import Annotated
 
 from torchcrf_scan.checks import Amount, OneOf, Positive, Seed, Share, Within, check_fields
 from torchcrf_scan.config import ModelConfig
-from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.data.worlds import NAMED_WORLDS
 from torchcrf_scan.learning.losses import LOSSES, NO_STEPS, STAGED
 
 Count = Annotated[int, Within(1, 1_000_000)]
 CountOrNone = Annotated[int, Within(0, 1_000_000)]
-World = Annotated[str, OneOf(*WORLDS)]
+World = Annotated[str, OneOf(*NAMED_WORLDS)]
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class GradientConfig:
         clip: norm to which gradients are clipped; 0: no clipping.
         amp: bfloat16 on GPUs that support it (torch.autocast); CPUs always use full precision.
         device: `auto` (a GPU if there is one), `cpu` or `cuda`.
-        worlds: names of the simulated `WORLDS` that pairs are drawn from.
+        worlds: names of the simulated `NAMED_WORLDS` that pairs are drawn from.
         fresh: share of the pairs that are simulated on the fly; the others are drawn from the training pairs.
         validation: share of the training pairs, in whole sequences, held out for validation; 0: no validation, and the last
             weights are kept instead of the best.
@@ -185,9 +185,9 @@ class DataConfig:
     Attributes:
         train: a file, folder or glob pattern of training pairs, or a list of them.
         test: the same for test pairs.
-        simulate_train: names of simulated `WORLDS` to train on too, `pairs` pairs each. For other worlds, `torchcrf-scan simulate`
-            writes files.
-        simulate_test: names of simulated `WORLDS` to test on too; train and test never share a seed.
+        simulate_train: names of simulated `NAMED_WORLDS` to train on too, `pairs` pairs each. For other worlds,
+            `torchcrf-scan simulate` writes files.
+        simulate_test: names of simulated `NAMED_WORLDS` to test on too; train and test never share a seed.
         pairs: pairs of every simulated world.
         sequences: sequences of every simulated world.
         seed: of the simulator.

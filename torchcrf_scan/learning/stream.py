@@ -14,7 +14,7 @@ import torch
 from torch.utils.data import Dataset
 
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.data.worlds import NAMED_WORLDS
 from torchcrf_scan.learning.augment import augment, frame_offset
 from torchcrf_scan.learning.settings import GradientConfig
 from torchcrf_scan.scan import Floats, ScanPair
@@ -60,7 +60,7 @@ class PairStream(Dataset[Sample]):
         place = int(torch.randint(len(places), (), generator=generator))
         if not is_fresh:
             return self.pairs[place]
-        return simulate_pairs(WORLDS[self.config.worlds[place]], 1, 1, seed_of(self.config.seed, index, 1))[0]
+        return simulate_pairs(NAMED_WORLDS[self.config.worlds[place]], 1, 1, seed_of(self.config.seed, index, 1))[0]
 
 
 @dataclass(frozen=True, slots=True)

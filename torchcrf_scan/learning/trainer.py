@@ -23,7 +23,7 @@ from torchcrf_scan.baselines.cascade import Cascade
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.dataset import PairFiles, split_by_sequence
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.data.worlds import WORLDS
+from torchcrf_scan.data.worlds import NAMED_WORLDS
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import Table, report
 from torchcrf_scan.evaluation.summary import summarise
@@ -187,7 +187,7 @@ def load_data(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
         patterns = (patterns,) if isinstance(patterns, str) else patterns
         pairs = list(PairFiles(*patterns)) if patterns else []
         for k, world in enumerate(worlds):
-            pairs += simulate_pairs(WORLDS[world], config.pairs, config.sequences, seed + k)
+            pairs += simulate_pairs(NAMED_WORLDS[world], config.pairs, config.sequences, seed + k)
         return pairs
 
     return (
