@@ -46,6 +46,15 @@ def run(arguments: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("is_anew", [True, False])
+def test_the_potential_of_movers_is_fitted_anew_or_kept(arguments: list[str], tmp_path: Path, is_anew: bool) -> None:
+    own = [of for of in arguments if not of.startswith("--model") and "steps" not in of]
+    steps = ["--learning.max_steps=10", "--gradient.steps=1", f"--gradient.refit_potential={str(is_anew).lower()}"]
+    load_main()([*own, *steps, "--init=simulated", f"--output={tmp_path / 'run'}"])
+    initial, fitted = (JointScanCRF.from_pretrained(name).cluster_potential for name in ("simulated", tmp_path / "run" / "model"))
+    assert (float(initial.score) != float(fitted.score)) == is_anew
+
+
 def test_the_run_folder_has_a_checkpoint_and_the_training_events(run: Path) -> None:
     names = {path.name for path in run.iterdir()}
     assert {"config.yaml", "versions.json", "metrics.json", "model", "events", "training", "checkpoint.pt"} <= names

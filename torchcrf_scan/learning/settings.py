@@ -144,6 +144,7 @@ class GradientConfig:
         validate_every: steps between validations.
         patience: validations without improvement after which training stops early; 0: never.
         checkpoint_every: steps between checkpoints.
+        refit_potential: fit the potential of movers' clusters anew after the steps; off, that of the initial weights is kept.
         graph: draw the module's graph in TensorBoard, which takes some seconds.
         seed: of all random draws: pair k of a run is a function of (seed, k) alone.
     """
@@ -166,6 +167,7 @@ class GradientConfig:
     validate_every: Count = 20
     patience: CountOrNone = 5
     checkpoint_every: Count = 20
+    refit_potential: bool = True
     graph: bool = True
     seed: Seed = 0
     augment: AugmentConfig = field(default_factory=AugmentConfig)
