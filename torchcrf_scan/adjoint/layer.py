@@ -165,7 +165,7 @@ class _Rounds(torch.autograd.Function):
         like: Tensor,
     ) -> tuple[Tensor, ...]:
         ctx.done, ctx.fitted, ctx.settings = done, fitted, settings
-        ctx.inputs = association.detach(), clustering.detach(), outlier, moving
+        ctx.inputs = [None if of is None else of.detach() for of in (association, clustering, outlier, moving)]
         found: list[Tensor] = []
         for states in zip(*([answer.state for answer in pair.answers] for pair in done), strict=True):
             K, D, N = max(of.candidates.shape[1] for of in states), states[0].log_cluster.shape[1], like.shape[1]
