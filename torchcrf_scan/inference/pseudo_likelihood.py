@@ -101,6 +101,12 @@ class Chain:
     known: Tensor
     extra: Tensor | None = None
 
+    def scored(self, weights: Tensor) -> Chain:
+        """The chain with one feature of nodes and one of edges, the weighted sums of these. weights: (U + P,)."""
+        split = self.unary.shape[-1]
+        unary, pairwise = self.unary @ weights[:split], self.pairwise @ weights[split:]
+        return replace(self, unary=unary[..., None], pairwise=pairwise[..., None])
+
     def design(self) -> Design:
         """The features of the pseudo-likelihood."""
         features = torch.cat([self.unary, at_true_neighbours(self.pairwise, self.label, self.known)], dim=-1)
@@ -240,11 +246,16 @@ def pseudo_log_likelihood(view: PairView, plugins: PlugIns, parameters: Paramete
     found = find_candidates(view, plugins.motions, plugins.active, config.inference)  # the same for both chains
     if config.has_association:
         chain = association_chain(view, plugins, parameters.scales, parameters.boosters, config.inference, found)
-        total = total + chain.design().log_likelihood(parameters.association).sum(-1)
+        total = total + pseudo_log_likelihood_of(chain, parameters.association)
     if config.has_clusters:
         chain = clustering_chain(view, plugins, parameters.scales, found)
-        total = total + chain.design().log_likelihood(parameters.clustering).sum(-1)
+        total = total + pseudo_log_likelihood_of(chain, parameters.clustering)
     return total
+
+
+def pseudo_log_likelihood_of(chain: Chain, weights: Tensor) -> Tensor:
+    """(B,) log pseudo-likelihood of one chain; weighed before the neighbours are looked up, one number instead of P features."""
+    return chain.scored(weights).design().log_likelihood(weights.new_ones(2)).sum(-1)
 
 
 def for_background_alone(plugins: PlugIns, batch: ScanPairBatch) -> PlugIns:
