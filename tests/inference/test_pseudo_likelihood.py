@@ -31,9 +31,8 @@ from torchcrf_scan.inference.pseudo_likelihood import (
     Design,
     PlugIns,
     association_chain,
-    association_design,
     at_true_neighbours,
-    clustering_design,
+    clustering_chain,
     for_background_alone,
     pseudo_log_likelihood,
     true_plugins,
@@ -111,7 +110,7 @@ def test_the_association_conditionals_equal_the_loops(seed: int) -> None:
     scales.local.mul_(10)  # else every error is as bad as any
     data, outlier = random_stumps(boosters.data, seed), random_stumps(boosters.outlier, seed + 7)
     plugins = plugins_of(batch)
-    design = association_design(PairView.of(batch), plugins, scales, boosters, DENSE)
+    design = association_chain(PairView.of(batch), plugins, scales, boosters, DENSE).design()
 
     source, target = batch.source[0].numpy(), batch.target[0].numpy()
     own = plugins.cluster[0].clamp(min=0)
@@ -140,7 +139,7 @@ def test_the_clustering_conditionals_equal_the_loops(seed: int) -> None:
     batch, scales = tiny(seed), Scales().double()
     scales.cluster_distance.fill_(1.0)
     plugins = plugins_of(batch)
-    design = clustering_design(PairView.of(batch), plugins, scales)
+    design = clustering_chain(PairView.of(batch), plugins, scales).design()
     arrays = batch.source[0].numpy(), batch.target[0].numpy(), plugins.motions[0].numpy()
     plugged = plugins.association[0].tolist()
     limits = float(scales.cluster_distance), float(scales.outlier_threshold)
@@ -156,8 +155,8 @@ def test_inactive_slots_are_no_alternative() -> None:
     plugins = true_plugins(batch, 4)
     assert plugins.active.tolist() == [[True, True, False, False]]
     weights = normal(21)
-    wide = clustering_design(PairView.of(batch), plugins, Scales().double()).log_likelihood(weights)
-    narrow = clustering_design(PairView.of(batch), true_plugins(batch, 2), Scales().double()).log_likelihood(weights)
+    wide = clustering_chain(PairView.of(batch), plugins, Scales().double()).design().log_likelihood(weights)
+    narrow = clustering_chain(PairView.of(batch), true_plugins(batch, 2), Scales().double()).design().log_likelihood(weights)
     assert_close(wide, narrow)
 
 
@@ -165,8 +164,13 @@ def test_the_joint_is_the_sum_of_both_chains() -> None:
     batch, scales, boosters = tiny(), Scales().double(), Boosters(1).double()
     parameters = Parameters(normal(23), normal(21, seed=1), scales, boosters)
     view, plugins = PairView.of(batch), plugins_of(batch)
-    first = association_design(view, plugins, scales, boosters, InferenceConfig()).log_likelihood(parameters.association).sum(-1)
-    second = clustering_design(view, plugins, scales).log_likelihood(parameters.clustering).sum(-1)
+    first = (
+        association_chain(view, plugins, scales, boosters, InferenceConfig())
+        .design()
+        .log_likelihood(parameters.association)
+        .sum(-1)
+    )
+    second = clustering_chain(view, plugins, scales).design().log_likelihood(parameters.clustering).sum(-1)
     for chains, expected in (("joint", first + second), ("matching", first), ("clustering", second)):
         assert_close(pseudo_log_likelihood(view, plugins, parameters, ModelConfig(chains=chains)), expected)
 
@@ -208,9 +212,9 @@ def test_the_gradient_equals_central_differences(pairs: ScanPairBatch) -> None:
 def test_the_hessian_is_positive_definite_with_the_prior(pairs: ScanPairBatch, chain: str) -> None:
     view, plugins, scales = PairView.of(pairs), true_plugins(pairs, 7), Scales().double()
     design = (
-        association_design(view, plugins, scales, Boosters(1).double(), InferenceConfig())
+        association_chain(view, plugins, scales, Boosters(1).double(), InferenceConfig()).design()
         if chain == "association"
-        else clustering_design(view, plugins, scales)
+        else clustering_chain(view, plugins, scales).design()
     )
     prior = 10.0
 
@@ -229,8 +233,8 @@ def test_the_hessian_is_positive_definite_with_the_prior(pairs: ScanPairBatch, c
 def designs(batch: ScanPairBatch) -> list[Design]:
     view, plugins = PairView.of(batch), true_plugins(batch, C)
     return [
-        association_design(view, plugins, Scales().double(), Boosters(1).double(), DENSE),
-        clustering_design(view, plugins, Scales().double()),
+        association_chain(view, plugins, Scales().double(), Boosters(1).double(), DENSE).design(),
+        clustering_chain(view, plugins, Scales().double()).design(),
     ]
 
 

@@ -1,8 +1,8 @@
 """Pseudo-likelihood of an annotation: every label given its neighbours' true labels (spec 6.2).
 
-It needs the features only, as one tensor per chain: `association_design` and `clustering_design`, rows = nodes, columns =
-states. The objective is that of a conditional logit model, convex in the weights; learning builds the designs once and
-optimises on them. `Chain` keeps the transitions too, for the exact likelihood (spec 6.5).
+It needs the features only, as one tensor per chain: `Chain.design`, rows = nodes, columns = states. The objective is that of a
+conditional logit model, convex in the weights; learning builds the designs once and optimises on them. `Chain` keeps the
+transitions too, for the exact likelihood (spec 6.5).
 """
 
 from __future__ import annotations
@@ -191,11 +191,6 @@ def states_with_truth(
     return as_found, as_found.with_targets(true, put), label
 
 
-def association_design(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> Design:
-    """The association chain's 23 features of every state at the true labels of its neighbours."""
-    return association_chain(view, plugins, scales, boosters, config).design()
-
-
 def clustering_chain(view: PairView, plugins: PlugIns, scales: Scales, found: candidate_search.Candidates | None = None) -> Chain:
     """The clustering chain's 13 + 8 features. found: the candidates at the plug-ins' motions; None: they are searched."""
     batch = view.batch
@@ -209,11 +204,6 @@ def clustering_chain(view: PairView, plugins: PlugIns, scales: Scales, found: ca
     known = plugins.known & batch.source_mask
     possible = possible_clusters(plugins.active, view.within(plugins.reach), label.shape[1])
     return Chain(local, pairwise, possible, label, known, clustering_extra(view.learned, C + 1))
-
-
-def clustering_design(view: PairView, plugins: PlugIns, scales: Scales) -> Design:
-    """The clustering chain's 21 features of every state at the true labels of its neighbours."""
-    return clustering_chain(view, plugins, scales).design()
 
 
 def at_true_neighbours(pairwise: Tensor, label: Tensor, known: Tensor) -> Tensor:
