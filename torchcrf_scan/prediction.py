@@ -81,7 +81,7 @@ class Uncertainty:
 class Prediction:
     """Output of the model for a batch; tensors by point, batch first. The README lists the gradient of every output and its cost.
 
-    Integers and booleans have no gradient; no output has one if the loops (backend `compiled`) or the schedule `flooding` ran.
+    Integers and booleans have no gradient; no output has one with the schedule `flooding`.
 
     Attributes:
         association: (B, N) int64 target point, -1 outlier.
