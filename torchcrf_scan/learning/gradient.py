@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 from torch.optim import AdamW
+from torch.optim.swa_utils import AveragedModel
 
 from torchcrf_scan.learning.checkpoint import Store, set_random_state
 from torchcrf_scan.learning.losses import LOSSES
@@ -72,6 +73,7 @@ class Learner:
         self.schedule = make_schedule(self.optimiser, config)
         self.stopping = EarlyStopping(config.patience)
         self.best: dict[str, Tensor] | None = None
+        self.mean = AveragedModel(self.model)
         self.step = 0
 
     def state_dict(self) -> dict[str, Any]:
@@ -80,6 +82,7 @@ class Learner:
             "step": self.step,
             "model": self.model.state_dict(),
             "best": self.best,
+            "mean": self.mean.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "schedule": self.schedule.state_dict(),
             "stopping": self.stopping.state_dict(),
@@ -90,6 +93,7 @@ class Learner:
         state = copy.deepcopy(state)
         self.step, self.best = state["step"], state["best"]
         self.model.load_state_dict(state["model"])
+        self.mean.load_state_dict(state["mean"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.schedule.load_state_dict(state["schedule"])
         self.stopping.load_state_dict(state["stopping"])
@@ -116,6 +120,8 @@ class Learner:
         self.optimiser.step()
         self.schedule.step()
         self.step += 1
+        if self.step > self.config.steps * (1 - self.config.average):
+            self.mean.update_parameters(self.model)
         return Report(self.step, means, norm, norms, rate, self.config.batch_size, total, time.perf_counter() - began)
 
     def _average(self, sums: dict[str, Tensor], nodes: Tensor) -> tuple[dict[str, float], int]:
@@ -151,6 +157,13 @@ class Learner:
         """Updates the best weights and the early stopping by a validation loss."""
         if self.stopping.look(self.step, loss):
             self.best = copy.deepcopy(self.model.state_dict())
+
+    def leave_best(self) -> None:
+        """Leaves the weights of the least validation loss in the model, else the mean of the last steps, if there is one."""
+        if self.best is not None:
+            self.model.load_state_dict(self.best)
+        elif int(self.mean.n_averaged):
+            self.model.load_state_dict(self.mean.module.state_dict())
 
 
 def has_amp(config: GradientConfig, device: torch.device) -> bool:
@@ -230,7 +243,6 @@ def train_by_gradient(
             look()
         if learner.step % gradient.checkpoint_every == 0 or is_last or learner.stopping.is_over:
             save()
-    if learner.best is not None:
-        model.load_state_dict(learner.best)
+    learner.leave_best()
     model.to("cpu").eval()
     return learner

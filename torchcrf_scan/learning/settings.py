@@ -134,6 +134,7 @@ class GradientConfig:
         weight_decay: of AdamW.
         warmup: steps of linear increase to the maximal learning rate, which then decays along a cosine.
         final_rate: final learning rate as a share of the maximum.
+        average: share of the steps, the last ones, whose mean weights are kept where nothing is validated; 0: the last weights.
         clip: norm to which gradients are clipped; 0: no clipping.
         amp: bfloat16 on GPUs that support it (torch.autocast); CPUs always use full precision.
         device: `auto` (a GPU if there is one), `cpu` or `cuda`.
@@ -158,6 +159,7 @@ class GradientConfig:
     weight_decay: Amount = 0.0
     warmup: CountOrNone = 10
     final_rate: Share = 0.05
+    average: Share = 0.0
     clip: Amount = 1.0
     amp: bool = False
     device: Annotated[str, OneOf("auto", "cpu", "cuda")] = "auto"
