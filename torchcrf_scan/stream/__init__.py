@@ -1,0 +1,1 @@
+"""Scans one by one: ego motion, moving points and tracked objects."""
