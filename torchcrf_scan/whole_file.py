@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     Raises:
         OSError: the file could not be written.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = _beside(path)
     try:
         with temporary.open("wb") as file:
             yield file
@@ -28,11 +29,39 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    folder = os.open(path.parent, os.O_RDONLY)
+    _sync(path.parent)
+
+
+@contextmanager
+def whole_path(path: Path) -> Iterator[Path]:
+    """As `whole_file`, for libraries that write by name: the path of a file or folder of the same name, elsewhere.
+
+    Raises:
+        OSError: the block wrote nothing there, or it could not be moved.
+    """
+    beside = _beside(path)
+    beside.mkdir()
     try:
-        os.fsync(folder)  # makes the rename durable, not only the content
+        yield beside / path.name
+        if path.is_dir():
+            shutil.rmtree(path)
+        os.replace(beside / path.name, path)
     finally:
-        os.close(folder)
+        shutil.rmtree(beside)
+    _sync(path.parent)
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}")
+
+
+def _sync(folder: Path) -> None:
+    """Makes what was renamed in a folder durable, not only its content."""
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
 
 
 def write_whole(path: Path, content: bytes | str) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchcrf_scan.result import MovingObject
+from torchcrf_scan.result import MovingObject, ScanResult, Status
 from torchcrf_scan.scan import Floats
 
 PATH = 4000  # rows of a path that are kept at most
@@ -15,6 +17,44 @@ TRACKS = 300
 TRACK_PATH = 200  # rows of a track
 CELL = (0.02, 0.5)  # metres, the finest and the coarsest that a map begins with
 CELLS_ACROSS = 250  # of the typical range of the first scan, at the beginning
+
+
+STATUSES: tuple[Status, ...] = ("ok", "degenerate", "lost")
+
+
+@dataclass
+class Tally:
+    """Counts of a recording.
+
+    Attributes:
+        scans: number of results, and by `statuses`. metres: travelled. seconds: from the first to the last. objects: their numbers.
+    """
+
+    scans: int = 0
+    metres: float = 0.0
+    seconds: float = 0.0
+    statuses: Counter[Status] = field(default_factory=Counter)
+    objects: set[int] = field(default_factory=set)
+    _first: float = 0.0
+    _last: Floats | None = None
+
+    def add(self, result: ScanResult) -> None:
+        """Counts one result."""
+        self.scans += 1
+        self.statuses[result.status] += 1
+        self.objects.update(one.number for one in result.objects)
+        if self._last is None:
+            self._first = result.stamp
+        else:
+            self.metres += float(np.hypot(*(result.pose[1:] - self._last)))
+        self.seconds = result.stamp - self._first
+        self._last = result.pose[1:].copy()
+
+    def describe(self) -> str:
+        """The counts in words."""
+        shares = [f"{status} {100 * self.statuses[status] / max(self.scans, 1):.1f} %" for status in STATUSES if self.statuses[status]]
+        moving = f"{len(self.objects)} moving object{'' if len(self.objects) == 1 else 's'}"
+        return f"{self.scans} scans, {self.seconds:.1f} s, {self.metres:.1f} m travelled, {moving}; {', '.join(shares)}"
 
 
 class Path:
@@ -101,7 +141,6 @@ class TrackPaths:
     def __init__(self, limit: int = TRACKS) -> None:
         self._limit = limit
         self.paths: dict[int, Path] = {}
-        self.count = 0  # of all objects, forgotten ones too
 
     def add(self, stamp: float, objects: Iterable[MovingObject]) -> None:
         """Adds where the objects are now; predicted positions are left out."""
@@ -109,7 +148,6 @@ class TrackPaths:
             if one.points == 0:
                 continue
             if one.number not in self.paths:
-                self.count += 1
                 self.paths[one.number] = Path(3, TRACK_PATH)
             self.paths[one.number].add(stamp, *one.position)
             if len(self.paths) > self._limit:

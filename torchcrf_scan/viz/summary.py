@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +11,7 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.result import ScanResult, Status
 from torchcrf_scan.scan import BACKGROUND, Floats
 from torchcrf_scan.viz.frames import STATUS_COLORS
-from torchcrf_scan.viz.history import Path, StaticMap, TrackPaths, travelled
+from torchcrf_scan.viz.history import STATUSES, Path, StaticMap, Tally, TrackPaths, travelled
 from torchcrf_scan.viz.marks import INK, NOTE, mover_look
 from torchcrf_scan.viz.scene import Window
 
@@ -26,28 +24,21 @@ LEFT, RIGHT, TOP, BOTTOM, GAP = 0.6, 0.25, 1.0, 0.5, 0.22  # inches around them
 FLATTEST, TALLEST = 0.35, 1.1  # height over width of the map
 MAP = "#9AA3AD"
 LABELS = 40  # tracks with a number at most, the longest
+LEAST_BAR = 0.03  # share of the recording; shorter bars have no number
 LEAST_TRACK = 0.3  # metres; shorter tracks have no number on the map
-STATUSES: tuple[Status, ...] = ("ok", "degenerate", "lost")
 
 
-@dataclass
 class Summary:
-    """What a picture of a recording needs; memory does not grow with the recording.
+    """What a picture of a recording needs; memory does not grow with the recording."""
 
-    Attributes:
-        scans: number of results. metres: travelled by the sensor. statuses: number of results of each.
-    """
-
-    scans: int = 0
-    metres: float = 0.0
-    statuses: Counter[Status] = field(default_factory=Counter)
-    _map: StaticMap = field(default_factory=StaticMap)
-    _path: Path = field(default_factory=lambda: Path(6))  # stamp, x, y, speed, objects, status
-    _tracks: TrackPaths = field(default_factory=TrackPaths)
-    _last: Floats | None = None
+    def __init__(self) -> None:
+        self.tally = Tally()
+        self._map, self._tracks = StaticMap(), TrackPaths()
+        self._path = Path(6)  # stamp, x, y, speed, number of objects, status
 
     def add(self, result: ScanResult) -> None:
         """Adds one result."""
+        self.tally.add(result)
         scan = result.scan
         static = (result.track == BACKGROUND)[scan.beam] & ~result.moving[scan.beam]
         if result.status != "lost":
@@ -55,27 +46,6 @@ class Summary:
         self._tracks.add(result.stamp, result.objects)
         speed = float(np.hypot(*result.twist[1:]))
         self._path.add(result.stamp, *result.pose[1:], speed, len(result.objects), STATUSES.index(result.status))
-        if self._last is not None:
-            self.metres += float(np.hypot(*(result.pose[1:] - self._last)))
-        self._last = result.pose[1:].copy()
-        self.scans += 1
-        self.statuses[result.status] += 1
-
-    @property
-    def objects(self) -> int:
-        """Number of objects seen."""
-        return self._tracks.count
-
-    @property
-    def seconds(self) -> float:
-        """Between the first and the last result."""
-        stamps = self._path.rows[:, 0]
-        return float(stamps[-1] - stamps[0]) if len(stamps) else 0.0
-
-    def describe(self) -> str:
-        """Numbers in one line."""
-        shares = [f"{status} {100 * self.statuses[status] / max(self.scans, 1):.1f} %" for status in STATUSES if self.statuses[status]]
-        return f"{self.scans} scans, {self.seconds:.1f} s, {self.metres:.1f} m travelled, {self.objects} moving objects; {', '.join(shares)}"
 
     def plot(self, name: str) -> Figure:
         """The picture. name: of the recording."""
@@ -91,7 +61,7 @@ class Summary:
         boxes = [np.array([LEFT, bottom, WIDTH, tall]) / size for bottom, tall in zip(bottoms, (height, STRIP, STRIP), strict=True)]
         plane, speed, objects = (figure.add_axes(tuple(box)) for box in boxes)
         figure.text(LEFT / size[0], 1 - 0.32 / size[1], name, fontsize=15, fontweight="bold", color=INK, parse_math=False)
-        figure.text(LEFT / size[0], 1 - 0.58 / size[1], self.describe(), fontsize=9.5, color=NOTE)
+        figure.text(LEFT / size[0], 1 - 0.58 / size[1], self.tally.describe(), fontsize=9.5, color=NOTE)
         self._draw_plane(plane, low, high)
         self._draw_speed(speed)
         self._draw_objects(objects)
@@ -125,7 +95,7 @@ class Summary:
         """What is on the map."""
         ax.plot([], [], color=INK, lw=1.4, label="sensor, from \N{WHITE CIRCLE} to \N{BLACK CIRCLE}")
         for status in STATUSES[1:]:
-            if self.statuses[status]:
+            if self.tally.statuses[status]:
                 ax.plot([], [], color=STATUS_COLORS[status], lw=2.2, label=f"its pose {status}")
         if self._tracks.paths:
             ax.plot([], [], color=mover_look(1)[0], lw=1.5, label="moving objects, by number")
@@ -154,6 +124,9 @@ class Summary:
             lane = next((k for k, free in enumerate(ends) if free <= first), len(ends))
             ends[lane:lane + 1] = [last + 0.004 * (end - begin)]
             ax.broken_barh([(first, last - first)], (lane + 0.1, 0.8), color=mover_look(number)[0], lw=0)
+            if last - first > LEAST_BAR * (end - begin):
+                place = ((first + last) / 2, lane + 0.47)
+                ax.text(*place, str(number), ha="center", va="center", fontsize=6.5, color="white", fontweight="bold", clip_on=True)
         ax.set(xlim=(0, max(end - begin, 1e-3)), ylim=(0, max(len(ends), 3)), yticks=[], xlabel="seconds")
         ax.xaxis.label.set(fontsize=8.5, color=NOTE)
         if not ends:

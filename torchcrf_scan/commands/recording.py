@@ -1,0 +1,173 @@
+"""A recording from its first scan to its last, or to its fault, through a stream and into outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain, islice
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from tqdm import tqdm
+
+from torchcrf_scan.commands.arguments import load_model
+from torchcrf_scan.commands.failures import one_line
+from torchcrf_scan.commands.outputs import Add, Output, Outputs
+from torchcrf_scan.commands.stopping import Stopping
+from torchcrf_scan.data.formats import read_scans
+from torchcrf_scan.data.reading import Reading
+from torchcrf_scan.result import ScanResult
+from torchcrf_scan.scan import Floats, Scan
+from torchcrf_scan.stream.stream import ScanStream
+from torchcrf_scan.viz.history import Tally
+
+LOOK_AHEAD = 21  # readings from whose stamps the time between scans is found
+SECONDS = (0.005, 5.0)  # between scans, plausible ones
+ENDINGS = (".gz", ".log", ".bag", ".mcap", ".db3", ".csv", ".txt", ".npz")
+
+
+class Stream(Protocol):
+    """What makes results of scans."""
+
+    def feed(self, scan: Scan, stamp: float, odometry: Floats | None = None) -> ScanResult:
+        """What is known after one more scan."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How recordings are read and processed, as the commands' options of the same names."""
+
+    every: int = 1
+    start: float = 0.0
+    end: float | None = None
+    topic: str | None = None
+    model: str = ""
+    device: str = "cpu"
+    threads: int | None = None
+    use_odometry: bool = False
+    visualize: bool = False
+    rerun: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise ValueError(f"--every: expected at least 1, got {self.every}")
+        if not 0 <= self.start < np.inf:
+            raise ValueError(f"--start: expected seconds from the first scan on, at least 0, got {self.start}")
+        if self.end is not None and not self.end > self.start:
+            raise ValueError(f"--end: expected more seconds than --start = {self.start}, got {self.end}")
+
+    def make_stream(self) -> Callable[[], Stream]:
+        """A maker of streams that share one model; raises ValueError for a model or device that is not there."""
+        model = load_model(self.model, None, self.device, self.threads)
+        return lambda: ScanStream(model)
+
+
+@dataclass
+class Report:
+    """What became of a recording.
+
+    Attributes:
+        tally: counts of its results. bad: number of scans that gave none; first_bad: why the first did not.
+        failures: what went wrong, one line each. rate: scans a second. is_interrupted: Ctrl-C ended it.
+    """
+
+    tally: Tally = field(default_factory=Tally)
+    bad: int = 0
+    first_bad: str = ""
+    failures: list[str] = field(default_factory=list)
+    rate: float = 0.0
+    is_interrupted: bool = False
+
+    def describe(self) -> str:
+        """One line."""
+        bad = f"; {self.bad} scans left out, the first because of {self.first_bad}" if self.bad else ""
+        return f"{self.tally.describe()}; {self.rate:.1f} scans/s{bad}"
+
+
+def chosen(readings: Iterable[Reading], options: Options) -> Iterator[Reading]:
+    """Every N-th reading between two times, seconds after the first one."""
+    first: float | None = None
+    count = 0
+    for reading in readings:
+        first = reading.stamp if first is None else first
+        since = reading.stamp - first
+        if options.end is not None and since > options.end:
+            return
+        if since >= options.start:
+            if count % options.every == 0:
+                yield reading
+            count += 1
+
+
+def until_fault(readings: Iterator[Reading], failures: list[str]) -> Iterator[Reading]:
+    """The readings before a fault, which is added to `failures`."""
+    try:
+        yield from readings
+    except (ValueError, OSError) as error:
+        failures.append(one_line(error))
+
+
+def process(
+    log: str,
+    options: Options,
+    stream: Stream,
+    outputs: Callable[[float], Mapping[str, Output]],
+    stopping: Stopping,
+    position: int = 0,
+) -> Report:
+    """Feeds a recording to a stream and its results to outputs; what came before a fault is processed.
+
+    Args:
+        outputs: of the seconds between two scans.
+        position: line of the progress bar.
+
+    Raises:
+        ValueError: a recording without a scan; then there are no outputs.
+    """
+    report = Report()
+    readings = until_fault(chosen(read_scans(log, options.topic), options), report.failures)
+    ahead = list(islice(readings, LOOK_AHEAD))
+    if not ahead:
+        raise ValueError(report.failures[0] if report.failures else f"{log}: expected scans in the chosen time, got none")
+    if options.use_odometry and all(reading.odometry is None for reading in ahead):
+        raise ValueError(f"--use_odometry: expected a recording with odometry, got none in {log}")
+    with (
+        Outputs(outputs(typical_seconds(ahead)), report.failures) as add,
+        tqdm(unit="scan", desc=log_name(log), disable=None, position=position, smoothing=0.1) as bar,
+    ):
+        for reading in chain(ahead, readings):
+            _feed(stream, reading, options, add, report)
+            bar.update()
+            if stopping.is_asked:
+                report.is_interrupted = True
+                break
+        report.rate = report.tally.scans / max(bar.format_dict["elapsed"], 1e-9)
+    return report
+
+
+def _feed(stream: Stream, reading: Reading, options: Options, add: Add, report: Report) -> None:
+    """One reading; a bad one is counted and left out."""
+    try:
+        result = stream.feed(reading.scan, reading.stamp, reading.odometry if options.use_odometry else None)
+    except ValueError as error:
+        report.first_bad = report.first_bad or one_line(error)
+        report.bad += 1
+        return
+    report.tally.add(result)
+    add(result)
+
+
+def typical_seconds(readings: list[Reading]) -> float:
+    """The median time between readings, where it is plausible; 0.1 s otherwise."""
+    steps = np.diff([reading.stamp for reading in readings])
+    plausible = steps[(steps >= SECONDS[0]) & (steps <= SECONDS[1])]
+    return float(np.median(plausible)) if len(plausible) else 0.1
+
+
+def log_name(log: str) -> str:
+    """The name of a recording: that of its file, without the endings that tell its format."""
+    name = Path(log).name
+    while Path(name).suffix in ENDINGS and Path(name).stem:
+        name = Path(name).stem
+    return name
