@@ -2,6 +2,7 @@
 
 import gzip
 import math
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -231,6 +232,19 @@ def test_text_without_end_is_refused_before_it_fills_the_memory(tmp_path: Path, 
     (tmp_path / "b.log").write_text("nothing to see\n" * 1000)
     with pytest.raises(ValueError, match=r"b\.log: expected a scan within the first 10000 bytes, got none"):
         CarmenLog(tmp_path / "b.log")
+
+
+def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    lines = [line(list(rng.uniform(1, 9, 180)), (0, 0, 0), k) for k in range(400)]
+    peaks = []
+    for times in (1, 10):
+        (tmp_path / "run.log.gz").write_bytes(gzip.compress("\n".join(lines * times).encode(), 1))
+        tracemalloc.start()
+        assert sum(len(reading.scan) for reading in read_carmen(tmp_path / "run.log.gz")) == 400 * 180 * times
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.2 * peaks[0]
 
 
 @pytest.mark.skipif(not LOGS.is_dir(), reason="the recordings are not here")

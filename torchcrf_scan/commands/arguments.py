@@ -76,8 +76,9 @@ def find_pairs(patterns: Sequence[str], every: int, failures: list[str], options
         raise ValueError(f"--every: expected at least 1, got {every}")
     logs = {path for path in paths if attempt([], is_recording, path)}
     if not logs and (every > 1 or options != AS_RECORDED):
-        option = f"--every: expected a log to take every {every}-th pair of" if every > 1 else f"{options}: expected a log"
-        raise ValueError(f"{option}, got pair files alone")
+        every_nth = f"--every: expected a log to take every {every}-th pair of"
+        told = every_nth if every > 1 else "--topic, --odometry, --no_return: expected a log to read with them"
+        raise ValueError(f"{told}, got pair files alone")
     found = []
     for path in paths:
         if path not in logs:

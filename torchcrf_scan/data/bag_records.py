@@ -20,13 +20,20 @@ class Topic:
 
     Attributes:
         name: e.g. /scan. type: e.g. sensor_msgs/msg/LaserScan. definition: of the type, as the bag holds it; may be empty.
-        is_idl: whether that is in IDL.
+        is_idl: whether that is in IDL. is_cdr: whether messages are in CDR, as ROS 2 writes them; else as ROS 1 does.
     """
 
     name: str
     type: str
     definition: str
     is_idl: bool = False
+    is_cdr: bool = True
+
+
+def type_name(name: str) -> str:
+    """A type's name as in ROS 2: sensor_msgs/LaserScan is sensor_msgs/msg/LaserScan."""
+    package, _, kind = name.rpartition("/")
+    return f"{package.removesuffix('/msg')}/msg/{kind}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +47,9 @@ class Message:
 
 
 class Bag(Protocol):
-    """A bag in any format; its messages are ROS 1's or CDR."""
+    """A bag in any format."""
 
     path: Path
-    is_cdr: bool
 
     def topics(self) -> list[Topic]:
         """The topics, in the order in which they were found."""

@@ -1,4 +1,4 @@
-"""MCAP files of ROS 2, record by record: https://mcap.dev/spec.
+"""MCAP files of ROS, record by record: https://mcap.dev/spec.
 
 Whole ones list their channels in a summary at the end; those of a recording that was cut are found by reading what there is.
 """
@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, unpack
+from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, type_name, unpack
 from torchcrf_scan.data.limits import MOST_CHUNK
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -20,15 +20,13 @@ FOOTER_BYTES = 9 + 20 + len(MAGIC)
 
 
 class McapBag:
-    """An MCAP file whose messages are CDR."""
-
-    is_cdr = True
+    """An MCAP file of ROS 2 or ROS 1."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def topics(self) -> list[Topic]:
-        """The topics by the file's summary, or by its records if it has none."""
+        """The topics by the file's summary, or by its records if it has none; raises ValueError if none of them is whole."""
         found = _Channels()
         with open(self.path, "rb") as file:
             for start in (self._summary(file), len(MAGIC)):
@@ -50,8 +48,10 @@ class McapBag:
         try:
             for _ in _walk(file, start, found):
                 pass
-        except DAMAGES:
-            return  # told when its messages are read
+        except DAMAGES as error:
+            if not found.topics and start == len(MAGIC):
+                raise self._fault(file, error) from error
+            # else told when the messages are read
 
     def messages(self, names: Collection[str]) -> Iterator[Message]:
         """The messages of some topics in the order of the file.
@@ -65,7 +65,10 @@ class McapBag:
                     if topic.name in names:
                         yield Message(topic, stamp, data, f"{self.path}, record at byte {offset}")
             except DAMAGES as error:
-                raise ValueError(f"{self.path}, byte {file.tell()}: expected a whole record of MCAP, got {error}") from error
+                raise self._fault(file, error) from error
+
+    def _fault(self, file: BinaryIO, error: Exception) -> ValueError:
+        return ValueError(f"{self.path}, byte {file.tell()}: expected a whole record of MCAP, got {error}")
 
 
 class _Channels:
@@ -83,7 +86,8 @@ class _Channels:
             return
         (schema,) = struct.unpack("<H", file.read(2))
         name, encoding, definition = self.schemas.get(schema, ("", "", ""))
-        self.topics[number] = Topic(_string(file), name, definition, encoding.endswith("idl"))
+        topic, written = _string(file), _string(file)
+        self.topics[number] = Topic(topic, type_name(name), definition, encoding.endswith("idl"), written != "ros1")
 
 
 def _walk(file: BinaryIO, start: int, found: _Channels) -> Iterator[tuple[Topic, float, bytes, int]]:

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, unpack
+from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, type_name, unpack
 from torchcrf_scan.data.limits import MOST_CHUNK
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -23,13 +23,11 @@ Fields = dict[bytes, bytes]
 class Ros1Bag:
     """A bag of ROS 1."""
 
-    is_cdr = False
-
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def topics(self) -> list[Topic]:
-        """The topics by the bag's index, or by its records if it has none."""
+        """The topics by the bag's index, or by its records if it has none; raises ValueError if none of them is whole."""
         connections: dict[int, Topic] = {}
         with open(self.path, "rb") as file:
             try:
@@ -54,8 +52,10 @@ class Ros1Bag:
         try:
             for _ in _walk(file, len(MAGIC), connections):
                 pass
-        except DAMAGES:
-            return  # told when its messages are read
+        except DAMAGES as error:
+            if not connections:
+                raise self._fault(file, error) from error
+            # else told when the messages are read
 
     def messages(self, names: Collection[str]) -> Iterator[Message]:
         """The messages of some topics in the order of the file.
@@ -70,7 +70,10 @@ class Ros1Bag:
                     if topic.name in names:
                         yield Message(topic, stamp, data, f"{self.path}, chunk at byte {offset}")
             except DAMAGES as error:
-                raise ValueError(f"{self.path}, byte {file.tell()}: expected a whole record of a bag, got {error}") from error
+                raise self._fault(file, error) from error
+
+    def _fault(self, file: BinaryIO, error: Exception) -> ValueError:
+        return ValueError(f"{self.path}, byte {file.tell()}: expected a whole record of a bag, got {error}")
 
 
 def _walk(
@@ -102,10 +105,9 @@ def _messages_of(chunk: BinaryIO, connections: dict[int, Topic]) -> Iterator[tup
 
 def _note(fields: Fields, data: bytes, connections: dict[int, Topic]) -> None:
     told = _fields(data)
-    package, _, name = told[b"type"].decode().rpartition("/")
     definition = told[b"message_definition"].decode(errors="replace")
     topic = "/" + fields[b"topic"].decode().strip("/")
-    connections[struct.unpack("<L", fields[b"conn"])[0]] = Topic(topic, f"{package.removesuffix('/msg')}/msg/{name}", definition)
+    connections[struct.unpack("<L", fields[b"conn"])[0]] = Topic(topic, type_name(told[b"type"].decode()), definition, is_cdr=False)
 
 
 def _next_record(file: BinaryIO) -> tuple[Fields, bytes] | None:

@@ -20,8 +20,6 @@ METADATA = "metadata.yaml"
 class SqliteBag:
     """A database of messages."""
 
-    is_cdr = True
-
     def __init__(self, path: Path) -> None:
         self.path = path
 
@@ -69,8 +67,6 @@ class FolderBag:
     Raises:
         ValueError: metadata that are missing or damaged, files that are missing, of another format, or packed as a whole.
     """
-
-    is_cdr = True
 
     def __init__(self, path: Path) -> None:
         self.path = path

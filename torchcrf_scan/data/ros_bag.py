@@ -97,13 +97,13 @@ class _Reader:
     """Decodes the messages of a bag."""
 
     def __init__(self, bag: Bag, topics: list[Topic], scans: Topic, no_return: float) -> None:
-        self._store, self._is_cdr = _typestore(bag, topics), bag.is_cdr
+        self._store = _typestore(bag, topics, scans.is_cdr)
         self._scan_of, self._no_return = SCANS[scans.type], no_return
 
     def decode(self, message: Message) -> Any:
         """The message as an object; raises ValueError with its place."""
         try:
-            if self._is_cdr:
+            if message.topic.is_cdr:
                 return self._store.deserialize_cdr(message.data, message.topic.type)
             return self._store.deserialize_ros1(message.data, message.topic.type)
         except Exception as error:  # a library's, of damaged bytes
@@ -136,13 +136,13 @@ def _with_odometry(bag: Bag, read: _Reader, topics: list[Topic], scans: Topic, o
     yield from beside.rest()
 
 
-def _typestore(bag: Bag, topics: list[Topic]) -> Typestore:
+def _typestore(bag: Bag, topics: list[Topic], is_cdr: bool) -> Typestore:
     """The types that the bag defines, and those of ROS where it does not; raises ValueError without rosbags."""
     try:
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     except ImportError as error:
         raise ValueError(f"{bag.path}: expected the library rosbags, which reads bags (extra `ros`), got {error}") from error
-    store = get_typestore(Stores.LATEST if bag.is_cdr else Stores.ROS1_NOETIC)
+    store = get_typestore(Stores.LATEST if is_cdr else Stores.ROS1_NOETIC)
     wanted = (LASER, CLOUD, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
     found: dict[str, Any] = {}
     for topic in topics:

@@ -27,7 +27,8 @@ def plausible_steps(stamps: Floats) -> tuple[Floats, Bools]:
     Returns:
         (S-1,) seconds, all above 0, and (S-1,) bool.
     """
-    steps = np.diff(np.asarray(stamps, dtype=np.float64))
+    with np.errstate(invalid="ignore", over="ignore"):
+        steps = np.diff(np.asarray(stamps, dtype=np.float64))
     forward = np.isfinite(steps) & (steps > 0) & (steps < LONGEST)
     standing = steps == 0
     if standing.mean() > STANDING if len(steps) else False:
