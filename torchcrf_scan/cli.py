@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 
-from jsonargparse import ArgumentParser
+from jsonargparse import ActionYesNo, ArgumentParser
 
 from torchcrf_scan import __version__
 from torchcrf_scan.commands.bench import bench
@@ -18,11 +18,19 @@ from torchcrf_scan.commands.evaluate import evaluate
 from torchcrf_scan.commands.experiment import experiment, experiment_parser
 from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.commands.match import match
+from torchcrf_scan.commands.odometry import odometry
+from torchcrf_scan.commands.play import play
 from torchcrf_scan.commands.plot import plot
 from torchcrf_scan.commands.prepare import prepare
+from torchcrf_scan.commands.run import run
 from torchcrf_scan.commands.simulate import simulate
+from torchcrf_scan.commands.track import track
 
 COMMANDS: Mapping[str, Callable[..., int]] = {
+    "run": run,
+    "odometry": odometry,
+    "track": track,
+    "play": play,
     "simulate": simulate,
     "match": match,
     "evaluate": evaluate,
@@ -37,6 +45,14 @@ POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: metavar,
     "files": ("PAIR.npz|LOG", "+", f"pair files (.npz), folders of them, logs ({LOGS}), or glob patterns"),
     "pair_files": ("PAIR.npz", "+", "pair files (.npz), folders of them, or glob patterns"),
     "file": ("PAIR.npz|LOG", None, f"a pair file (.npz), or with --number a log ({LOGS})"),
+    "logs": ("LOG", "+", f"logs ({LOGS})"),
+    "log": ("LOG", None, f"a log ({LOGS})"),
+}
+
+FLAGS: Mapping[str, str] = {  # parameter that is true or false: help
+    "use_odometry": "take the log's odometry as the first guess of the sensor's motion",
+    "clean": "also write the log again without the beams that hit moving objects, and a bag with the odometry found",
+    "visualize": "show everything in the viewer of rerun while it is computed (extra `viewer`)",
 }
 
 
@@ -76,7 +92,7 @@ def make_parser() -> ArgumentParser:
 
 
 def _command_parser(name: str, command: Callable[..., int], summary: str) -> ArgumentParser:
-    """Options from the signature; parameters in `POSITIONAL` become positional arguments."""
+    """Options from the signature; parameters in `POSITIONAL` become positional arguments, those in `FLAGS` take no value."""
     parameters = inspect.signature(command).parameters
     forms = {key: metavar + (" ..." if count else "") for key, (metavar, count, _) in POSITIONAL.items()}
     shown = [form for key, form in {**forms, "output": "--output OUTPUT"}.items() if key in parameters]
@@ -84,7 +100,10 @@ def _command_parser(name: str, command: Callable[..., int], summary: str) -> Arg
     for key, (metavar, count, meaning) in POSITIONAL.items():
         if key in parameters:
             parser.add_argument(key, type=str, metavar=metavar, nargs=count, help=meaning)
-    parser.add_function_arguments(command, as_group=False, as_positional=False, skip=set(POSITIONAL))
+    parser.add_function_arguments(command, as_group=False, as_positional=False, skip={*POSITIONAL, *FLAGS})
+    for key, meaning in FLAGS.items():
+        if key in parameters:
+            parser.add_argument(f"--{key}", action=ActionYesNo, default=False, help=meaning)
     return parser
 
 

@@ -88,6 +88,12 @@ def movie_file(path: Path, seconds: float, speed: float, is_in_world: bool) -> I
         yield add
 
 
+def check_speed(speed: float) -> None:
+    """Raises ValueError for a speed that a movie cannot have."""
+    if not 0 < speed < float("inf"):
+        raise ValueError(f"--speed: expected more than 0 times the recording's own, got {speed}")
+
+
 @contextmanager
 def summary_picture(path: Path, name: str) -> Iterator[Add]:
     """A picture of the whole recording."""
@@ -96,5 +102,19 @@ def summary_picture(path: Path, name: str) -> Iterator[Add]:
 
     summary = Summary()
     yield summary.add
-    if summary.scans:
+    if summary.tally.scans:
         save_figure(summary.plot(name), path)
+
+
+def viewers(visualize: bool, rerun: str | None) -> dict[str, Output]:
+    """The viewer's window and file, as far as they are asked for; raises ValueError where it is not installed."""
+    from torchcrf_scan.viz.viewer import check_viewer, showing, writing_rerun
+
+    found: dict[str, Output] = {}
+    if visualize:
+        check_viewer("--visualize")
+        found["--visualize"] = showing()
+    if rerun is not None:
+        check_viewer("--rerun")
+        found["--rerun"] = writing_rerun(Path(rerun))
+    return found

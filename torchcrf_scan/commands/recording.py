@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
+from time import perf_counter
 from typing import Protocol
 
 import numpy as np
@@ -13,18 +15,21 @@ from tqdm import tqdm
 
 from torchcrf_scan.commands.arguments import load_model
 from torchcrf_scan.commands.failures import one_line
-from torchcrf_scan.commands.outputs import Add, Output, Outputs
-from torchcrf_scan.commands.stopping import Stopping
+from torchcrf_scan.commands.outputs import Add, Output, Outputs, viewers
+from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
 from torchcrf_scan.data.formats import read_scans
+from torchcrf_scan.data.options import AUTO, ReadOptions
 from torchcrf_scan.data.reading import Reading
+from torchcrf_scan.data.recording import log_name
 from torchcrf_scan.result import ScanResult
 from torchcrf_scan.scan import Floats, Scan
 from torchcrf_scan.stream.stream import ScanStream
 from torchcrf_scan.viz.history import Tally
 
+MakeOutputs = Callable[[float], Mapping[str, Output]]  # of the seconds between two scans
+
 LOOK_AHEAD = 21  # readings from whose stamps the time between scans is found
 SECONDS = (0.005, 5.0)  # between scans, plausible ones
-ENDINGS = (".gz", ".log", ".bag", ".mcap", ".db3", ".csv", ".txt", ".npz")
 
 
 class Stream(Protocol):
@@ -46,6 +51,8 @@ class Options:
     device: str = "cpu"
     threads: int | None = None
     use_odometry: bool = False
+    odometry: str | None = None
+    no_return: float | None = None
     visualize: bool = False
     rerun: str | None = None
 
@@ -56,6 +63,16 @@ class Options:
             raise ValueError(f"--start: expected seconds from the first scan on, at least 0, got {self.start}")
         if self.end is not None and not self.end > self.start:
             raise ValueError(f"--end: expected more seconds than --start = {self.start}, got {self.end}")
+
+    @property
+    def reading(self) -> ReadOptions:
+        """The options of the reader."""
+        return ReadOptions(self.topic, self.odometry or (AUTO if self.use_odometry else None), self.no_return)
+
+    @property
+    def has_odometry(self) -> bool:
+        """Whether the recording's odometry is used."""
+        return self.use_odometry or self.odometry is not None
 
     def make_stream(self) -> Callable[[], Stream]:
         """A maker of streams that share one model; raises ValueError for a model or device that is not there."""
@@ -112,29 +129,31 @@ def process(
     log: str,
     options: Options,
     stream: Stream,
-    outputs: Callable[[float], Mapping[str, Output]],
+    outputs: MakeOutputs,
     stopping: Stopping,
     position: int = 0,
 ) -> Report:
     """Feeds a recording to a stream and its results to outputs; what came before a fault is processed.
 
     Args:
-        outputs: of the seconds between two scans.
+        outputs: makes them, once there is a scan.
         position: line of the progress bar.
 
     Raises:
         ValueError: a recording without a scan; then there are no outputs.
     """
-    report = Report()
-    readings = until_fault(chosen(read_scans(log, options.topic), options), report.failures)
+    report, told = Report(), options.reading
+    topic, odometry, no_return = told.topic, told.odometry, told.no_return
+    readings = until_fault(chosen(read_scans(log, topic, odometry=odometry, no_return=no_return), options), report.failures)
     ahead = list(islice(readings, LOOK_AHEAD))
     if not ahead:
         raise ValueError(report.failures[0] if report.failures else f"{log}: expected scans in the chosen time, got none")
-    if options.use_odometry and all(reading.odometry is None for reading in ahead):
+    if options.has_odometry and all(reading.odometry is None for reading in ahead):
         raise ValueError(f"--use_odometry: expected a recording with odometry, got none in {log}")
+    begin = perf_counter()
     with (
         Outputs(outputs(typical_seconds(ahead)), report.failures) as add,
-        tqdm(unit="scan", desc=log_name(log), disable=None, position=position, smoothing=0.1) as bar,
+        tqdm(unit="scan", desc=log_name(Path(log)), disable=None, position=position, smoothing=0.1) as bar,
     ):
         for reading in chain(ahead, readings):
             _feed(stream, reading, options, add, report)
@@ -142,14 +161,14 @@ def process(
             if stopping.is_asked:
                 report.is_interrupted = True
                 break
-        report.rate = report.tally.scans / max(bar.format_dict["elapsed"], 1e-9)
+        report.rate = report.tally.scans / (perf_counter() - begin)
     return report
 
 
 def _feed(stream: Stream, reading: Reading, options: Options, add: Add, report: Report) -> None:
     """One reading; a bad one is counted and left out."""
     try:
-        result = stream.feed(reading.scan, reading.stamp, reading.odometry if options.use_odometry else None)
+        result = stream.feed(reading.scan, reading.stamp, reading.odometry if options.has_odometry else None)
     except ValueError as error:
         report.first_bad = report.first_bad or one_line(error)
         report.bad += 1
@@ -165,9 +184,17 @@ def typical_seconds(readings: list[Reading]) -> float:
     return float(np.median(plausible)) if len(plausible) else 0.1
 
 
-def log_name(log: str) -> str:
-    """The name of a recording: that of its file, without the endings that tell its format."""
-    name = Path(log).name
-    while Path(name).suffix in ENDINGS and Path(name).stem:
-        name = Path(name).stem
-    return name
+def process_one(command: str, log: str, options: Options, outputs: MakeOutputs, made: str) -> int:
+    """Processes one recording for a command, says what was made, and returns the command's exit code."""
+    viewers(options.visualize, options.rerun)  # an error now, not after the first scans
+    make_stream = options.make_stream()
+
+    def all_outputs(seconds: float) -> Mapping[str, Output]:
+        return {**outputs(seconds), **viewers(options.visualize, options.rerun)}
+
+    with Stopping() as stopping:
+        report = process(log, options, make_stream(), all_outputs, stopping)
+    print(f"{log}: {report.describe()}; {made}")
+    for failure in report.failures:
+        print(f"torchcrf-scan {command}: error: {failure}", file=sys.stderr)
+    return INTERRUPTED if report.is_interrupted else 1 if report.failures else 0

@@ -1,19 +1,23 @@
-"""`torchcrf-scan run`: everything that can be known of recordings, without any preparation."""
+"""`torchcrf-scan run`: the sensor's path, the moving objects, pictures and movies of recordings."""
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from torchcrf_scan.commands.arguments import make_folder
 from torchcrf_scan.commands.failures import one_line
-from torchcrf_scan.commands.outputs import Output, clean_log, movie_file, poses_file, summary_picture, tracks_file, viewers
-from torchcrf_scan.commands.recording import Options, Stream, log_name, process
+from torchcrf_scan.commands.outputs import Output, check_speed, movie_file, poses_file, summary_picture, tracks_file, viewers
+from torchcrf_scan.commands.recording import MakeOutputs, Options, Stream, process
 from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
+from torchcrf_scan.data.clean_log import clean_name, writing_clean
+from torchcrf_scan.data.recording import log_name
+from torchcrf_scan.learning.ranks import join
 from torchcrf_scan.pretrained import PRETRAINED
+from torchcrf_scan.viz.movie import can_write_mp4
 
 
 def run(
@@ -24,6 +28,8 @@ def run(
     start: float = 0.0,
     end: float | None = None,
     topic: str | None = None,
+    odometry: str | None = None,
+    no_return: float | None = None,
     model: str = PRETRAINED,
     device: str = "cpu",
     threads: int | None = None,
@@ -36,9 +42,9 @@ def run(
 ) -> int:
     """Finds the sensor's path and the moving objects of logs: poses.tum, tracks.csv, summary.png and movie.mp4 in OUTPUT.
 
-    Of several logs each has a folder of its own in OUTPUT, named like the log; `torchrun --nproc-per-node N -m torchcrf_scan run
-    LOG ...` deals them out to N processes. A log with a fault gives everything up to there, and does not stop the others.
-    Without the extra `movie` the movie is a short GIF.
+    Of several logs each gets a folder in OUTPUT, named like the log, and `torchrun --nproc-per-node N -m torchcrf_scan run LOG
+    ...` deals them out to N processes. A damaged log gives everything before its fault; a bad scan is left out and counted.
+    Without the extra `movie` there is a short movie.gif instead.
 
     Args:
         logs: recordings
@@ -46,18 +52,76 @@ def run(
         every: takes each N-th scan only
         start: seconds after the first scan at which to begin
         end: seconds after the first scan at which to end
-        topic: topic of the scans in a bag that has several
+        topic: topic of the scans in a bag, if there are several; of a CARMEN log the kind of lines, e.g. RLASER
+        odometry: topic of odometry in a bag that has several, to be used
+        no_return: readings in metres from there on mean that nothing came back; by default as the log says or shows
         model: folder of a saved model, or the name of one that the package ships
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; by default its own choice
-        use_odometry: begins each search at the motion that the log's odometry tells
-        clean: also writes the log again without the beams that hit moving objects
+        use_odometry: takes the log's odometry as the first guess of the sensor's motion
+        clean: also writes the log again without the beams that hit moving objects, and a bag with the odometry found
         frame: what stands still in the movie, world or sensor
-        speed: of the movie, as a multiple of the recording's own
+        speed: of the movie, as a multiple of the log's own
         visualize: shows everything in the viewer of rerun while it is computed
-        rerun: file (.rrd) for that viewer to write
+        rerun: file (.rrd) to write for that viewer
     """
-    options = Options(every, start, end, topic, model, device, threads, use_odometry, visualize, rerun)
+    options = Options(every, start, end, topic, model, device, threads, use_odometry, odometry, no_return, visualize, rerun)
     folders = _folders(logs, Path(output))
+    check_speed(speed)
     if rerun is not None and len(logs) > 1:
-        raise ValueError(f"--rerun: expected one log, got {len(logs)}")
+        raise ValueError(f"--rerun: expected one log to write {rerun} of, got {len(logs)}")
+    if clean and every > 1:
+        raise ValueError(f"--clean: expected every scan to be taken, got --every {every}")
+    viewers(visualize, rerun)  # an error now, not after the first scans
+    make_stream = options.make_stream()
+    failures: list[str] = []
+    with join("cpu") as ranks, Stopping() as stopping:
+        for log, folder in list(folders.items())[ranks.rank :: ranks.world]:
+            if not stopping.is_asked:
+                make = partial(_outputs, Path(log), folder, options, clean, frame == "world", speed)
+                failures += _run_one(log, folder, options, make_stream(), make, stopping, ranks.rank)
+        everyone = [failure for part in ranks.gather(failures) for failure in part]
+        is_first = ranks.is_first
+    for failure in everyone if is_first else []:
+        print(f"torchcrf-scan run: error: {failure}", file=sys.stderr)
+    return INTERRUPTED if stopping.is_asked else 1 if everyone else 0
+
+
+def _folders(logs: Sequence[str], output: Path) -> dict[str, Path]:
+    """The folder of every log; raises ValueError for two logs of the same name."""
+    if len(logs) == 1:
+        return {logs[0]: output}
+    folders = {log: output / log_name(Path(log)) for log in logs}
+    if len(set(folders.values())) < len(logs):
+        raise ValueError(f"logs: expected logs whose names differ, got {', '.join(logs)}")
+    return folders
+
+
+def _outputs(
+    log: Path, folder: Path, options: Options, clean: bool, is_in_world: bool, speed: float, seconds: float
+) -> Mapping[str, Output]:
+    """All that is made of a log whose scans are `seconds` apart."""
+    make_folder("--output", folder)
+    movie = folder / ("movie.mp4" if can_write_mp4() else "movie.gif")
+    outputs: dict[str, Output] = {
+        "poses.tum": poses_file(folder / "poses.tum"),
+        "tracks.csv": tracks_file(folder / "tracks.csv"),
+        "summary.png": summary_picture(folder / "summary.png", log_name(log)),
+        movie.name: movie_file(movie, seconds, speed, is_in_world),
+        **viewers(options.visualize, options.rerun),
+    }
+    if clean:
+        outputs["--clean"] = writing_clean(log, folder / clean_name(log), options.reading)
+    return outputs
+
+
+def _run_one(
+    log: str, folder: Path, options: Options, stream: Stream, make: MakeOutputs, stopping: Stopping, position: int
+) -> list[str]:
+    """Makes everything of one log, and says so; returns what went wrong."""
+    try:
+        report = process(log, options, stream, make, stopping, position)
+    except (ValueError, OSError) as error:
+        return [one_line(error)]
+    print(f"{log}: {report.describe()}; in {folder}", flush=True)
+    return report.failures

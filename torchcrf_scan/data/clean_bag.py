@@ -13,22 +13,23 @@ from typing import Any
 
 import numpy as np
 
+from torchcrf_scan.data.ros_messages import CLOUD, LASER, ODOMETRY, TYPES, stamp_of
 from torchcrf_scan.data.spatial_covariance import spatial_covariance
 from torchcrf_scan.result import ScanResult
 from torchcrf_scan.scan import Bools
 from torchcrf_scan.whole_file import whole_path
 
-ODOMETRY = "/torchcrf_scan/odometry"  # topic of what was found
+FOUND = "/torchcrf_scan/odometry"  # topic of the odometry that was found
 FRAME = "odom"  # its frame
-SCANS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2")
 VERSION = 8  # of the metadata of a ROS 2 bag, which all distributions in use read
 STAMP_ERROR = 1e-6  # seconds
+XYZ = ("x", "y", "z")
 
 Write = Callable[[ScanResult], None]
 
 
 @contextmanager
-def writing_clean_bag(source: Path, target: Path, topic: str) -> Iterator[Write]:
+def writing_clean_bag(source: Path, target: Path, topic: str | None = None) -> Iterator[Write]:
     """A bag under construction: yields `write(result)`, to be called with the results of the source's scans in their order.
 
     Messages of the topic for which there is no result are left out; those of other topics are copied up to the last result, and
@@ -36,14 +37,25 @@ def writing_clean_bag(source: Path, target: Path, topic: str) -> Iterator[Write]
 
     Args:
         source: ROS 1 bag (.bag) or folder of a ROS 2 bag.
-        topic: of the scans.
+        topic: of the scans; None: the only one.
+
+    Raises:
+        ValueError: a bag that rosbags cannot read, or a result that does not belong to it.
     """
     from rosbags.highlevel import AnyReader
 
     with whole_path(target) as temporary, AnyReader([source]) as reader, _writer(reader, source, temporary) as writer:
-        copy = _Copy(reader, writer, topic)
+        copy = _Copy(reader, writer, _scans(reader, topic))
         yield copy.write
         copy.finish()
+
+
+def _scans(reader: Any, topic: str | None) -> str:
+    """The name of the topic with the scans."""
+    names = {kind: [one.topic for one in reader.connections if one.msgtype == kind] for kind in (LASER, CLOUD)}
+    if topic is None:
+        return str([*names[LASER], *names[CLOUD]][0])
+    return next(str(name) for name in names[LASER] + names[CLOUD] if name.strip("/") == topic.strip("/"))
 
 
 def _writer(reader: Any, source: Path, target: Path) -> Any:
@@ -67,7 +79,7 @@ class _Copy:
         self._reader, self._writer, self._topic = reader, writer, topic
         self._types = get_typestore(Stores.ROS2_HUMBLE if reader.is2 else Stores.ROS1_NOETIC)
         self._connections = {connection.id: _add(writer, connection, reader) for connection in reader.connections}
-        self._odometry = writer.add_connection(ODOMETRY, "nav_msgs/msg/Odometry", typestore=self._types)
+        self._odometry = writer.add_connection(FOUND, ODOMETRY, typestore=self._types)
         self._messages = reader.messages()
 
     def write(self, result: ScanResult) -> None:
@@ -77,13 +89,15 @@ class _Copy:
                 self._writer.write(self._connections[connection.id], stamp, data)
                 continue
             message = self._reader.deserialize(data, connection.msgtype)
-            if is_scan_of(message, result):
+            if is_scan_of(message, stamp, result):
                 clean = self._bytes(self._reader.typestore, blank(message, result.moving))
                 self._writer.write(self._connections[connection.id], stamp, clean)
                 odometry = odometry_message(self._types.types, message.header, result)
                 self._writer.write(self._odometry, stamp, self._bytes(self._types, odometry))
                 return
-        raise ValueError(f"{self._reader.paths[0]}: expected the scan of {result.stamp:.6f} s on {self._topic}, got no such message")
+        raise ValueError(
+            f"{self._reader.paths[0]}: expected the scan of {result.stamp:.6f} s on {self._topic}, got no such message"
+        )
 
     def finish(self) -> None:
         """Copies what follows the last result, up to the next scan."""
@@ -93,7 +107,7 @@ class _Copy:
             self._writer.write(self._connections[connection.id], stamp, data)
 
     def _is_scan(self, connection: Any) -> bool:
-        return connection.topic == self._topic and connection.msgtype in SCANS
+        return connection.topic == self._topic and connection.msgtype in (LASER, CLOUD)
 
     def _bytes(self, types: Any, message: Any) -> Any:
         serialize = types.serialize_cdr if self._reader.is2 else types.serialize_ros1
@@ -111,28 +125,28 @@ def _add(writer: Any, connection: Any, reader: Any) -> Any:
     return writer.add_connection(connection.topic, connection.msgtype, **known)
 
 
-def is_scan_of(message: Any, result: ScanResult) -> bool:
-    """Whether a message is the scan of a result."""
-    is_laser = hasattr(message, "ranges")
-    beams = len(message.ranges) if is_laser else message.width * message.height
-    stamp = message.header.stamp
-    return bool(beams == len(result.moving) and abs(stamp.sec + 1e-9 * stamp.nanosec - result.stamp) < STAMP_ERROR)
+def is_scan_of(message: Any, recorded: int, result: ScanResult) -> bool:
+    """Whether a message is the scan of a result. recorded: nanoseconds, for messages whose own stamp is 0."""
+    beams = len(message.ranges) if message.__msgtype__ == LASER else message.width * message.height
+    stamp = stamp_of(message.header) or 1e-9 * recorded
+    return bool(beams == len(result.moving) and abs(stamp - result.stamp) < STAMP_ERROR)
 
 
 def blank(message: Any, moving: Bools) -> Any:
     """A scan's message with NaN where a beam hit something that moves."""
-    if hasattr(message, "ranges"):
+    if message.__msgtype__ == LASER:
         return replace(message, ranges=np.where(moving, np.float32(np.nan), message.ranges).astype(np.float32))
     order = ">" if message.is_bigendian else "<"
-    fields = {field.name: field.offset for field in message.fields if field.name in "xyz"}
-    layout = np.dtype({
-        "names": list(fields), "formats": [f"{order}f4"] * len(fields), "offsets": list(fields.values()), "itemsize": message.point_step
-    })  # fmt: skip
-    data = message.data.copy()
-    rows = data.reshape(message.height, message.row_step)[:, : message.width * message.point_step]
-    mask = moving.reshape(message.height, message.width)
-    for name in fields:
-        rows.view(layout)[name][mask] = np.nan
+    fields = {field.name: (f"{order}{TYPES[field.datatype]}", field.offset) for field in message.fields if field.name in XYZ}
+    layout = np.dtype(
+        {"names": list(fields), "formats": [f for f, _ in fields.values()], "offsets": [o for _, o in fields.values()],
+         "itemsize": message.point_step}
+    )  # fmt: skip
+    data = np.array(message.data, dtype=np.uint8)
+    for row, hit in zip(data.reshape(message.height, message.row_step), moving.reshape(message.height, message.width), strict=True):
+        points = row[: message.width * message.point_step].view(layout)
+        for name in fields:
+            points[name][hit] = np.nan
     return replace(message, data=data)
 
 
@@ -153,7 +167,7 @@ def odometry_message(types: Any, header: Any, result: ScanResult) -> Any:
     stamp = make("builtin_interfaces/msg/Time", header.stamp.sec, header.stamp.nanosec)
     sequence = [header.seq] if hasattr(header, "seq") else []  # ROS 1 numbers its messages
     return make(
-        "nav_msgs/msg/Odometry",
+        ODOMETRY,
         make("std_msgs/msg/Header", *sequence, stamp, FRAME),
         header.frame_id,
         make("geometry_msgs/msg/PoseWithCovariance", pose, spatial_covariance(result.covariance)),

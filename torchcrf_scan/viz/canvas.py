@@ -71,7 +71,9 @@ class Canvas:
             self._dots.set(data=points.T, color=color, markersize=size, marker=marker)
             self._draw(self._dots)
 
-    def lines(self, lines: Sequence[Floats], color: str | Sequence[str], width: float, alpha: float = 1.0, style: Any = "-") -> None:
+    def lines(
+        self, lines: Sequence[Floats], color: str | Sequence[str], width: float, alpha: float = 1.0, style: Any = "-"
+    ) -> None:
         """Polygonal lines, (P, 2) each; one colour or one each."""
         if len(lines):
             self._lines.set(segments=lines, color=color, linewidth=width, alpha=alpha, linestyle=style)

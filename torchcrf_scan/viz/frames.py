@@ -115,7 +115,11 @@ class FramePainter:
         tails = [se2.apply(view, np.array(self._tails[one.number])[:, 1:]) for one in objects]
         self._canvas.lines(tails, colors, 1.6, 0.5)
         for seen, style in ((True, "-"), (False, (0, (3, 2)))):
-            part = [(se2.apply(view, box_of(one)), color) for one, color in zip(objects, colors, strict=True) if seen == (one.points > 0)]
+            part = [
+                (se2.apply(view, box_of(one)), color)
+                for one, color in zip(objects, colors, strict=True)
+                if seen == (one.points > 0)
+            ]
             self._canvas.lines([box for box, _ in part], [color for _, color in part], 1.4, 0.9, style)
         arrows = [(_arrow(one, seconds, width), color) for one, color in zip(objects, colors, strict=True)]
         drawn = [(se2.apply(view, arrow), color) for arrow, color in arrows if arrow is not None]
@@ -173,7 +177,9 @@ def _arrow(one: MovingObject, seconds: float, width: float) -> Floats | None:
     if length < 2 * width:
         return None
     head = min(3.2 * width, 0.6 * length)
-    outline = np.array([[0, 0.5], [length - head, 0.5], [length - head, 1.5], [length, 0], [length - head, -1.5], [length - head, -0.5], [0, -0.5]])
+    outline = np.array(
+        [[0, 0.5], [length - head, 0.5], [length - head, 1.5], [length, 0], [length - head, -1.5], [length - head, -0.5], [0, -0.5]]
+    )
     direction = float(np.arctan2(one.velocity[1], one.velocity[0]))
     return se2.apply(np.array([direction, *one.position]), outline * (1.0, width))
 

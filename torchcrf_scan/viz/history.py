@@ -52,7 +52,9 @@ class Tally:
 
     def describe(self) -> str:
         """The counts in words."""
-        shares = [f"{status} {100 * self.statuses[status] / max(self.scans, 1):.1f} %" for status in STATUSES if self.statuses[status]]
+        shares = [
+            f"{status} {100 * self.statuses[status] / max(self.scans, 1):.1f} %" for status in STATUSES if self.statuses[status]
+        ]
         moving = f"{len(self.objects)} moving object{'' if len(self.objects) == 1 else 's'}"
         return f"{self.scans} scans, {self.seconds:.1f} s, {self.metres:.1f} m travelled, {moving}; {', '.join(shares)}"
 

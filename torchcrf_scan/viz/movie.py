@@ -72,7 +72,14 @@ def _writing_mp4(path: Path, size: tuple[int, int], rate: float) -> Iterator[Wri
 
     output = ["-preset", "veryfast", "-movflags", "+faststart", "-f", "mp4"]
     frames = write_frames(
-        str(path), size, fps=rate, quality=QUALITY, codec="libx264", macro_block_size=2, ffmpeg_log_level="error", output_params=output
+        str(path),
+        size,
+        fps=rate,
+        quality=QUALITY,
+        codec="libx264",
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+        output_params=output,
     )
     frames.send(None)
     try:
@@ -115,7 +122,9 @@ def _palette() -> Picture:
 
     colors = [to_rgb(color) for color in (INK, SEEN, *STATUS_COLORS.values(), *MOVERS)]
     shares = np.linspace(0, 1, SHADES, endpoint=False)[:, None, None]
-    mixed = np.concatenate([(np.array(colors) * (1 - shares) + shares).reshape(-1, 3), np.linspace(0, 1, 64)[:, None].repeat(3, axis=1)])
+    mixed = np.concatenate(
+        [(np.array(colors) * (1 - shares) + shares).reshape(-1, 3), np.linspace(0, 1, 64)[:, None].repeat(3, axis=1)]
+    )
     picture = Images.new("P", (1, 1))
     picture.putpalette((255 * mixed[:256]).round().astype(np.uint8).tobytes())
     return picture

@@ -87,7 +87,9 @@ class Summary:
             color, way = mover_look(number)[0], path.rows
             ax.plot(way[:, 1], way[:, 2], color=color, lw=1.5, alpha=0.85, zorder=4)
             if number in longest and lengths[number] > LEAST_TRACK:
-                label = ax.annotate(str(number), way[-1, 1:], (4, 4), textcoords="offset points", color=color, fontsize=8.5, zorder=6)
+                label = ax.annotate(
+                    str(number), way[-1, 1:], (4, 4), textcoords="offset points", color=color, fontsize=8.5, zorder=6
+                )
                 label.set(fontweight="bold", path_effects=_rim())
         self._legend(ax)
 
@@ -99,7 +101,9 @@ class Summary:
                 ax.plot([], [], color=STATUS_COLORS[status], lw=2.2, label=f"its pose {status}")
         if self._tracks.paths:
             ax.plot([], [], color=mover_look(1)[0], lw=1.5, label="moving objects, by number")
-        ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, frameon=False, fontsize=8.5, borderaxespad=0.1, markerscale=5)
+        ax.legend(
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, frameon=False, fontsize=8.5, borderaxespad=0.1, markerscale=5
+        )
 
     def _draw_speed(self, ax: Axes) -> None:
         """The sensor's speed over time, and when its pose was not sure."""
@@ -122,7 +126,7 @@ class Summary:
         for number, path in sorted(self._tracks.paths.items(), key=lambda item: float(item[1].rows[0, 0])):
             first, last = path.rows[[0, -1], 0] - begin
             lane = next((k for k, free in enumerate(ends) if free <= first), len(ends))
-            ends[lane:lane + 1] = [last + 0.004 * (end - begin)]
+            ends[lane : lane + 1] = [last + 0.004 * (end - begin)]
             ax.broken_barh([(first, last - first)], (lane + 0.1, 0.8), color=mover_look(number)[0], lw=0)
             if last - first > LEAST_BAR * (end - begin):
                 place = ((first + last) / 2, lane + 0.47)

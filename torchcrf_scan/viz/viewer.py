@@ -178,7 +178,10 @@ def _blueprint() -> Any:
     def since(boundary: Any) -> Any:
         return view.VisibleTimeRanges([VisibleTimeRange("time", start=boundary, end=TimeRangeBoundary.cursor_relative())])
 
-    shown = {"world/path": since(TimeRangeBoundary.infinite()), "world/static": since(TimeRangeBoundary.cursor_relative(seconds=-MAP_SECONDS))}
+    shown = {
+        "world/path": since(TimeRangeBoundary.infinite()),
+        "world/static": since(TimeRangeBoundary.cursor_relative(seconds=-MAP_SECONDS)),
+    }
     world = view.Spatial3DView(origin="world", name="world", background=(255, 255, 255), overrides=shown)
     speed = view.TimeSeriesView(contents=["speed"], name="speed, m/s")
     turn = view.TimeSeriesView(contents=["turn"], name="turn, deg/s")
