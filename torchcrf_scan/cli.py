@@ -17,6 +17,7 @@ from torchcrf_scan.commands.bench import bench
 from torchcrf_scan.commands.evaluate import evaluate
 from torchcrf_scan.commands.experiment import experiment, experiment_parser
 from torchcrf_scan.commands.failures import one_line
+from torchcrf_scan.commands.listen import listen
 from torchcrf_scan.commands.match import match
 from torchcrf_scan.commands.plot import plot
 from torchcrf_scan.commands.prepare import prepare
@@ -28,6 +29,7 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
     "evaluate": evaluate,
     "experiment": experiment,
     "plot": plot,
+    "listen": listen,
     "bench": bench,
     "prepare": prepare,
 }

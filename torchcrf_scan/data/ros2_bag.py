@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path, PurePath
+from typing import TYPE_CHECKING
 
 import yaml
 
 from torchcrf_scan.data.bag_records import Bag, Message, Topic, unpack_message
 from torchcrf_scan.data.mcap_bag import MAGIC, McapBag
+
+if TYPE_CHECKING:
+    import sqlite3
 
 SQLITE = b"SQLite format 3\0"
 METADATA = "metadata.yaml"
@@ -24,6 +27,8 @@ class SqliteBag:
         self.path = path
 
     def _open(self) -> closing[sqlite3.Connection]:
+        import sqlite3  # some Pythons have none
+
         return closing(sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True))
 
     def topics(self) -> list[Topic]:
@@ -32,7 +37,7 @@ class SqliteBag:
             try:
                 definitions = self._definitions(base)
                 rows = base.execute("SELECT name, type FROM topics ORDER BY id").fetchall()
-            except sqlite3.Error as error:
+            except base.Error as error:
                 raise ValueError(f"{self.path}: expected a database with topics, got {error}") from error
         return [Topic(name, kind, *definitions.get(kind, ("", False))) for name, kind in rows]
 
@@ -57,7 +62,7 @@ class SqliteBag:
                 for row, name, stamp, data in base.execute(query):
                     if name in names:
                         yield Message(topics[name], 1e-9 * stamp, data, f"{self.path}, row {row}")
-            except sqlite3.Error as error:
+            except base.Error as error:
                 raise ValueError(f"{self.path}, behind row {row}: expected a whole database, got {error}") from error
 
 
