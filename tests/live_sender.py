@@ -10,12 +10,13 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
-from bags import LASER, laser, room
+from bags import LASER, ODOMETRY, laser, room
 
 from torchcrf_scan.live.listener import OUTPUTS
 from torchcrf_scan.live.network import LOOPBACK, Connection, Network
 from torchcrf_scan.live.types import new
 
+GAP = 0.002  # seconds between odometry and scan
 SPEED = 1.0  # metres a second
 PATIENCE, QUIET = 20.0, 2.0  # seconds to find each other, and without answers until there will be none
 
@@ -24,15 +25,17 @@ def main(domain: int, count: int, rate: float, *bad: int) -> None:
     connection = Connection(Network(domain, (LOOPBACK,), LOOPBACK))
     writer = connection.writer("/scan", LASER)
     readers = {name: connection.reader(f"/torchcrf_scan/{name}", kind, 1000) for name, kind in OUTPUTS.items()}
-    slow = connection.reader("/torchcrf_scan/scan_static", LASER, 1)  # never takes
+    wheels = connection.writer("/wheels", ODOMETRY)
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end and not all(
-        [writer.get_matched_subscriptions(), *(reader.get_matched_publications() for reader in [*readers.values(), slow])]
+        [writer.get_matched_subscriptions(), *(reader.get_matched_publications() for reader in readers.values())]
     ):
         time.sleep(0.02)
     begin, answers = time.monotonic(), defaultdict(list)
     for k in range(count):
         time.sleep(max(begin + k / rate - time.monotonic(), 0))
+        wheels.write(new(ODOMETRY, pose={"pose": {"position": {"x": k / rate}, "orientation": {"w": 1.0}}}))
+        time.sleep(GAP)
         writer.write(scan(k, k / rate, is_bad=k in bad))
         gather(readers, answers)
     came, last = 0, time.monotonic()
@@ -53,7 +56,7 @@ def scan(k: int, seconds: float, *, is_bad: bool) -> Any:
 
 def gather(readers: dict[str, Any], answers: dict[str, list[Any]]) -> None:
     for name, reader in readers.items():
-        answers[name] += [TOLD[name](message) for message in reader.take(100)]
+        answers[name] += [TOLD[name](message) for message in reader.take(100) if message.sample_info.valid_data]
 
 
 def stamp(message: Any) -> float:

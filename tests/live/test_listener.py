@@ -3,9 +3,11 @@
 import json
 import logging
 import os
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import IO, Any
@@ -30,6 +32,7 @@ class Straight:
 
     def __init__(self, slow: float = 0.0, fails_at: int | None = None) -> None:
         self.stamps: list[float] = []
+        self.odometry: list[Floats | None] = []
         self.slow, self.fails_at = slow, fails_at
 
     def feed(self, scan: Scan, stamp: float, odometry: Floats | None = None) -> ScanResult:
@@ -37,6 +40,7 @@ class Straight:
             self.fails_at = None
             raise ZeroDivisionError("nobody thought of that")
         self.stamps.append(stamp)
+        self.odometry.append(odometry)
         time.sleep(self.slow)
         track = np.where((np.arange(scan.n_beams) // 10) == 1, 3, 0)
         one = MovingObject(3, np.array([1.0, 2.0]), np.array([0.5, 0.0]), np.eye(4), 0.0, (4.0, 2.0), 10, 1.0)
@@ -108,3 +112,45 @@ def test_scans_that_come_too_fast_are_left_out() -> None:
     assert max(one.seconds for one in answered) < 0.6  # two wait, one is answered
     assert stream.stamps[-1] == pytest.approx(100 + 59 / 40)
     assert len(told["odometry"]) == len(answered)
+
+
+def test_odometry_is_the_first_guess() -> None:
+    stream = Straight()
+    listen(stream, DOMAIN + 3, 20, 20.0, odometry="/wheels")
+    known = [pose[1] if pose is not None else np.nan for pose in stream.odometry]
+    np.testing.assert_allclose(known[5:], np.arange(5, 20) / 20, atol=0.051)  # perhaps that of the scan before
+    assert stream.stamps == pytest.approx(100 + np.arange(20) / 20)
+
+
+def test_a_subscriber_that_hangs_slows_nothing() -> None:
+    """A process that asked for every message, reliably, and then stops."""
+    domain = DOMAIN + 4
+    code = f"""
+import time
+from cyclonedds.qos import Policy
+from cyclonedds.sub import DataReader
+from torchcrf_scan.live.listener import OUTPUTS
+from torchcrf_scan.live.network import LOOPBACK, Connection, Network, _quality
+connection = Connection(Network({domain}, (LOOPBACK,), LOOPBACK))
+reliable = Policy.Reliability.Reliable(10**9)
+readers = [DataReader(connection.participant, connection._topic("/torchcrf_scan/" + name, kind), qos=_quality(kind, 100, reliable))
+           for name, kind in OUTPUTS.items()]
+while not all(reader.take(1) for reader in readers):
+    time.sleep(0.01)
+print("got all", flush=True)
+time.sleep(100)
+"""
+    stream, environment = Straight(), os.environ | {"PYTHONPATH": str(TESTS.parent)}
+    listener = Listener(Connection(Network(domain, (LOOPBACK,), LOOPBACK)), stream)
+    hanging = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
+    stopper = threading.Thread(target=lambda: hanging.stdout and hanging.stdout.readline() and hanging.send_signal(signal.SIGSTOP))
+    stopper.start()
+    with tempfile.TemporaryFile("w+") as told, robot(told, domain, 300, 40.0) as process:
+        answered = list(listener.listen(lambda: process.poll() is not None))
+        assert not stopper.is_alive(), "it did not hang"
+        hanging.kill()
+        hanging.communicate()
+        told.seek(0)
+        assert len(json.load(told)["scan_static"]) == 300
+    assert len(answered) == 300
+    assert np.quantile([one.seconds for one in answered], 0.95) < 0.05

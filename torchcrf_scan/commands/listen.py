@@ -25,7 +25,7 @@ def listen(
     odometry: str | None = None,
     prefix: str = "/torchcrf_scan",
     world: str = "odom",
-    waiting: int = 5,
+    waiting: int = 2,
     domain: int | None = None,
     peers: tuple[str, ...] = (),
     interface: str = "",
@@ -39,11 +39,11 @@ def listen(
 ) -> int:
     """Subscribes to sensor_msgs/LaserScan of ROS 2 and publishes odometry, moving objects and the scan without them.
 
-    ROS need not be installed: messages go over DDS (library cyclonedds), best effort, as drivers send scans. Published under
-    the prefix: odometry (nav_msgs/Odometry), objects (visualization_msgs/MarkerArray), obstacles
-    (nav2_dynamic_msgs/ObstacleArray), scan_static and scan_moving (the LaserScan with NaN for movers' beams, and for all others)
-    and scan_labels (with the labels as intensities: 0 background, k object k, -1 outlier). Runs until it is interrupted. Tried
-    with cyclonedds on both sides; other vendors' DDS is untested.
+    ROS need not be installed: messages go over DDS (library cyclonedds). Scans are read best effort, answers fit any subscriber,
+    and a slow one is never waited for. Published under the prefix: odometry (nav_msgs/Odometry), objects
+    (visualization_msgs/MarkerArray), obstacles (nav2_dynamic_msgs/ObstacleArray), scan_static and scan_moving (the LaserScan with
+    NaN for movers' beams, and for all others) and scan_labels (with the labels as intensities: 0 background, k object k, -1
+    outlier). Runs until it is interrupted. Tried with cyclonedds on both sides; other vendors' DDS is untested.
 
     Args:
         stream: settings of ego motion and objects

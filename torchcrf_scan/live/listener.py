@@ -72,7 +72,7 @@ class Listener:
         prefix: str = "/torchcrf_scan",
         odometry: str | None = None,
         world: str = "odom",
-        depth: int = 5,
+        depth: int = 2,
     ) -> None:
         self._stream, self._world = stream, world
         self._connection = connection  # what it made ends with it

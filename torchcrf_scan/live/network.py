@@ -1,4 +1,4 @@
-"""DDS as ROS 2 uses it: the domain, and readers and writers of topics, best effort."""
+"""DDS as ROS 2 uses it: the domain, and readers and writers of topics."""
 
 from __future__ import annotations
 
@@ -71,16 +71,19 @@ class Connection:
             raise ValueError(f"domain {number}: expected a network that cyclonedds can use, got {error}") from error
 
     def reader(self, topic: str, kind: str, depth: int) -> Any:
-        """A reader that keeps the newest `depth` messages of a topic."""
+        """A reader that keeps the newest `depth` messages of a topic, best effort: it fits any writer."""
+        from cyclonedds.qos import Policy
         from cyclonedds.sub import DataReader
 
-        return DataReader(self.participant, self._topic(topic, kind), qos=_quality(kind, depth))
+        return DataReader(self.participant, self._topic(topic, kind), qos=_quality(kind, depth, Policy.Reliability.BestEffort))
 
     def writer(self, topic: str, kind: str) -> Any:
-        """A writer that never waits for those who read."""
+        """A writer that fits any reader, also one that asks for reliability, and never waits for it."""
         from cyclonedds.pub import DataWriter
+        from cyclonedds.qos import Policy
 
-        return DataWriter(self.participant, self._topic(topic, kind), qos=_quality(kind, WAITING))
+        quality = _quality(kind, WAITING, Policy.Reliability.Reliable(max_blocking_time=0))
+        return DataWriter(self.participant, self._topic(topic, kind), qos=quality)
 
     def _topic(self, name: str, kind: str) -> Any:
         from cyclonedds.topic import Topic
@@ -96,12 +99,12 @@ def dds_name(topic: str) -> str:
     return "/".join(["rt", *parts])
 
 
-def _quality(kind: str, depth: int) -> Any:
-    """Quality of service like that of ROS 2 for sensor data; the type's hash goes with it."""
+def _quality(kind: str, depth: int, reliability: Any) -> Any:
+    """Quality of service like that of ROS 2; the type's hash goes with it."""
     from cyclonedds.qos import Policy, Qos
 
     return Qos(
-        Policy.Reliability.BestEffort,
+        reliability,
         Policy.Durability.Volatile,
         Policy.History.KeepLast(depth),
         Policy.DataRepresentation(use_cdrv0_representation=True),
