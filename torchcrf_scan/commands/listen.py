@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -23,6 +24,7 @@ def listen(
     *,
     topic: str = "/scan",
     odometry: str | None = None,
+    no_return: float = math.inf,
     prefix: str = "/torchcrf_scan",
     world: str = "odom",
     waiting: int = 2,
@@ -49,6 +51,7 @@ def listen(
         stream: settings of ego motion and objects
         topic: of the scans
         odometry: topic of nav_msgs/Odometry whose last pose is the first guess of the motion
+        no_return: readings in metres from there on mean that nothing came back, beside what the scans say
         prefix: of the topics that are published
         world: frame of the published odometry and objects, that of the first scan
         waiting: scans that may wait for an answer; when more come, the oldest are left out
@@ -68,7 +71,16 @@ def listen(
     network = Network(domain, (LOOPBACK,), LOOPBACK) if loopback else Network(domain, peers, interface)
     answering = ScanStream(load_model(model, None, device, threads), stream)
     connection = Connection(network)
-    listener = Listener(connection, answering, topic=topic, prefix=prefix, odometry=odometry, world=world, depth=waiting)
+    listener = Listener(
+        connection,
+        answering,
+        topic=topic,
+        prefix=prefix,
+        no_return=no_return,
+        odometry=odometry,
+        world=world,
+        depth=waiting,
+    )
     print(f"listening to {topic} in domain {network.number}", flush=True)
     report = Report(every)
     is_over = _limit(report, seconds, scans)

@@ -67,7 +67,7 @@ def find_format(path: str | Path) -> Format | None:
     """The format of a file or folder; None if it is none of `FORMATS`. Raises OSError if it cannot be read."""
     path = Path(path)
     if path.is_dir():
-        return FOLDER if (path / ros2_bag.METADATA).is_file() else None
+        return FOLDER if ros2_bag.is_folder_bag(path) else None
     with open_unpacked(path) as file:
         try:
             head = file.read(HEAD)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 SQLITE = b"SQLite format 3\0"
 METADATA = "metadata.yaml"
+SUFFIXES = (".mcap", ".db3")  # of the files in a folder that lacks it
 
 
 class SqliteBag:
@@ -67,20 +68,15 @@ class SqliteBag:
 
 
 class FolderBag:
-    """A folder of ROS 2: its files one after the other, as `metadata.yaml` lists them.
+    """A folder of ROS 2: its files one after the other, as `metadata.yaml` lists them; without it, by name.
 
     Raises:
-        ValueError: metadata that are missing or damaged, files that are missing, of another format, or packed as a whole.
+        ValueError: damaged metadata, files that are missing, of another format, or packed as a whole.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            told = yaml.safe_load((path / METADATA).read_text())["rosbag2_bagfile_information"]
-            names = [PurePath(name).name for name in told["relative_file_paths"]]
-            mode = (told.get("compression_mode") or "none").lower()
-        except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path / METADATA}: expected a list of files, got {type(error).__name__}: {error}") from error
+        names, mode = _listed(path) if (path / METADATA).is_file() else (sorted(file.name for file in _bags_in(path)), "none")
         if mode not in ("none", "", "message"):
             raise ValueError(f"{path}: expected messages packed one by one or not at all, got files packed by {mode}")
         self._is_packed = mode == "message"
@@ -95,6 +91,24 @@ class FolderBag:
         for part in self._parts:
             for message in part.messages(names):
                 yield _unpacked(message) if self._is_packed else message
+
+
+def is_folder_bag(path: Path) -> bool:
+    """Whether a folder is a bag: it has metadata, or what a recorder leaves that was killed before it wrote them."""
+    return path.is_dir() and ((path / METADATA).is_file() or any(_bags_in(path)))
+
+
+def _listed(path: Path) -> tuple[list[str], str]:
+    """Files and kind of packing by the metadata of a folder."""
+    try:
+        told = yaml.safe_load((path / METADATA).read_text())["rosbag2_bagfile_information"]
+        return [PurePath(name).name for name in told["relative_file_paths"]], (told.get("compression_mode") or "none").lower()
+    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path / METADATA}: expected a list of files, got {type(error).__name__}: {error}") from error
+
+
+def _bags_in(path: Path) -> Iterator[Path]:
+    return (file for file in path.iterdir() if file.suffix in SUFFIXES and file.is_file())
 
 
 def _part(path: Path) -> Bag:

@@ -59,6 +59,7 @@ class Listener:
     Args:
         connection: to a domain. stream: what answers.
         topic: of the scans. prefix: of the topics that are published, see `OUTPUTS`.
+        no_return: metres; readings from there on mean that nothing came back.
         odometry: topic of nav_msgs/Odometry whose last pose is the first guess; None: there is none.
         world: name of the frame of the first scan. depth: scans that may wait; when more come, the oldest are lost.
     """
@@ -70,11 +71,12 @@ class Listener:
         *,
         topic: str = "/scan",
         prefix: str = "/torchcrf_scan",
+        no_return: float = math.inf,
         odometry: str | None = None,
         world: str = "odom",
         depth: int = 2,
     ) -> None:
-        self._stream, self._world = stream, world
+        self._stream, self._world, self._no_return = stream, world, no_return
         self._connection = connection  # what it made ends with it
         self._writers = {name: connection.writer(f"{prefix}/{name}", kind) for name, kind in OUTPUTS.items()}
         self._odometry = None if odometry is None else connection.reader(odometry, ODOMETRY, 1)
@@ -94,7 +96,7 @@ class Listener:
                 yield Answered(result, _latency(sent, time.monotonic() - began))
 
     def _answer(self, message: Any) -> ScanResult:
-        result = self._stream.feed(laser_scan(message, math.inf), stamp_of(message.header), self._pose())
+        result = self._stream.feed(laser_scan(message, self._no_return), stamp_of(message.header), self._pose())
         stamp, world = message.header.stamp, self._world
         moving = np.asarray(result.moving)
         self._write("odometry", messages.odometry(result, stamp, world, message.header.frame_id))
