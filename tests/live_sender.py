@@ -1,17 +1,21 @@
 """A robot in a process of its own: sends scans over the loopback interface, and tells in JSON which answers came.
 
 python live_sender.py DOMAIN COUNT RATE [BAD ...]; BAD: numbers of scans whose bearings are of many turns.
+python live_sender.py DOMAIN COUNT LOG: the first scans of a log, at its own speed.
 """
 
 import json
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from bags import LASER, ODOMETRY, laser, room
 
+from torchcrf_scan.data.formats import read_scans
 from torchcrf_scan.live.listener import OUTPUTS
 from torchcrf_scan.live.network import LOOPBACK, Connection, Network
 from torchcrf_scan.live.types import new
@@ -21,22 +25,22 @@ SPEED = 1.0  # metres a second
 PATIENCE, QUIET = 20.0, 2.0  # seconds to find each other, and without answers until there will be none
 
 
-def main(domain: int, count: int, rate: float, *bad: int) -> None:
+def main(domain: int, messages: Iterable[tuple[float, Any]]) -> None:
+    """messages: seconds and scan."""
     connection = Connection(Network(domain, (LOOPBACK,), LOOPBACK))
-    writer = connection.writer("/scan", LASER)
+    writer, wheels = connection.writer("/scan", LASER), connection.writer("/wheels", ODOMETRY)
     readers = {name: connection.reader(f"/torchcrf_scan/{name}", kind, 1000) for name, kind in OUTPUTS.items()}
-    wheels = connection.writer("/wheels", ODOMETRY)
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end and not all(
         [writer.get_matched_subscriptions(), *(reader.get_matched_publications() for reader in readers.values())]
     ):
         time.sleep(0.02)
     begin, answers = time.monotonic(), defaultdict(list)
-    for k in range(count):
-        time.sleep(max(begin + k / rate - time.monotonic(), 0))
-        wheels.write(new(ODOMETRY, pose={"pose": {"position": {"x": k / rate}, "orientation": {"w": 1.0}}}))
+    for seconds, message in messages:
+        time.sleep(max(begin + seconds - time.monotonic(), 0))
+        wheels.write(new(ODOMETRY, pose={"pose": {"position": {"x": seconds}, "orientation": {"w": 1.0}}}))
         time.sleep(GAP)
-        writer.write(scan(k, k / rate, is_bad=k in bad))
+        writer.write(message)
         gather(readers, answers)
     came, last = 0, time.monotonic()
     while time.monotonic() - last < QUIET:
@@ -45,6 +49,25 @@ def main(domain: int, count: int, rate: float, *bad: int) -> None:
         if sum(map(len, answers.values())) > came:
             came, last = sum(map(len, answers.values())), time.monotonic()
     print(json.dumps(answers))
+
+
+def drive(count: int, rate: float, *bad: int) -> Iterator[tuple[float, Any]]:
+    for k in range(count):
+        yield k / rate, scan(k, k / rate, is_bad=k in bad)
+
+
+def replay(count: int, log: str) -> Iterator[tuple[float, Any]]:
+    """The scans of a log whose beams are a step apart, as messages."""
+    begin = None
+    for reading in islice(read_scans(log), count):
+        begin = reading.stamp if begin is None else begin
+        whole, bearings = reading.scan, reading.scan.beam_bearings
+        step = (whole.bearings[-1] - whole.bearings[0]) / (whole.beam[-1] - whole.beam[0])
+        first = bearings[whole.beam[0]] - step * whole.beam[0]
+        header = {"stamp": {"sec": int(reading.stamp), "nanosec": int(1e9 * (reading.stamp % 1))}, "frame_id": "laser"}
+        ranges = whole.to_beams(whole.ranges, np.nan).tolist()
+        limits = {"range_min": whole.range_min or 0.0, "range_max": whole.range_max or 0.0}
+        yield reading.stamp - begin, new(LASER, header=header, angle_min=first, angle_increment=step, ranges=ranges, **limits)
 
 
 def scan(k: int, seconds: float, *, is_bad: bool) -> Any:
@@ -83,5 +106,6 @@ TOLD = {
 }
 
 if __name__ == "__main__":
-    domain, count, rate, *bad = sys.argv[1:]
-    main(int(domain), int(count), float(rate), *map(int, bad))
+    domain, count, source, *bad = sys.argv[1:]
+    is_rate = source.replace(".", "").isdigit()
+    main(int(domain), drive(int(count), float(source), *map(int, bad)) if is_rate else replay(int(count), source))

@@ -32,7 +32,7 @@ def listen(
     peers: tuple[str, ...] = (),
     interface: str = "",
     loopback: bool = False,
-    every: float = 5.0,
+    report: float = 5.0,
     seconds: float | None = None,
     scans: int | None = None,
     model: str = PRETRAINED,
@@ -59,7 +59,7 @@ def listen(
         peers: addresses to look for others at, without multicast
         interface: address of the network interface
         loopback: this machine alone, without multicast
-        every: seconds between lines about rate and latency, 0 for none
+        report: seconds between lines about rate and latency, 0 for none
         seconds: ends after so many
         scans: ends after so many scans
         model: folder of a saved model, or the name of one that the package ships
@@ -82,13 +82,12 @@ def listen(
         depth=waiting,
     )
     print(f"listening to {topic} in domain {network.number}", flush=True)
-    report = Report(every)
-    is_over = _limit(report, seconds, scans)
+    counted = Report(report)
     try:
-        for answered in listener.listen(is_over):
-            report.add(answered)
+        for answered in listener.listen(_limit(counted, seconds, scans)):
+            counted.add(answered)
     finally:
-        print(report.line(), flush=True)
+        print(counted.line(), flush=True)
     return 0
 
 
