@@ -10,7 +10,7 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Bools, Floats
 from torchcrf_scan.stream import extent as box
 from torchcrf_scan.stream.filter import chi_square
-from torchcrf_scan.stream.track import VELOCITY_DOUBT, Sighting, Track, TrackerConfig
+from torchcrf_scan.stream.track import DOUBT, Sighting, Track, TrackerConfig
 
 POSITION_GATE = 13.8  # chi-square of two degrees of freedom, 99.9 %
 LOOSE = 0.2  # share of an object's size by which its visible part is uncertain
@@ -47,11 +47,11 @@ class Comparison:
         alike = chi_square(change, covariance[..., 2:, 2:] + np.stack([of.covariance for of in sightings]))  # (T, K)
         apart = ((seen.middle / (SMALL + extent)) ** 2).sum(-1)  # breaks ties of boxes within each other
         larger = np.log((SMALL + seen.size) / (SMALL + extent)).max(-1)
-        cost = near + np.minimum(alike, VELOCITY_DOUBT) + apart + LARGER * np.maximum(larger, 0) ** 2
+        cost = near + np.minimum(alike, DOUBT) + apart + LARGER * np.maximum(larger, 0) ** 2
         cost += GUESS * np.array([not track.is_confirmed for track in tracks])[:, None]
         self.cost = np.where((near < POSITION_GATE) & (cost < config.gate), cost, np.inf)
         is_inside = (np.abs(seen.middle) <= extent / 2 + WITHIN).all(-1)
-        self.is_part = is_inside & (alike < VELOCITY_DOUBT)
+        self.is_part = is_inside & (alike < DOUBT)
 
 
 def assign(cost: Floats) -> list[tuple[int, int]]:

@@ -16,8 +16,10 @@ from torchcrf_scan.stream import filter as kalman
 
 UNKNOWN_SPEED = 5.0  # m/s, standard deviation of a velocity that was not observed
 LONE_SPACING = 0.1  # metres, of an object of one point
+PARTIAL = 0.05  # share of an object's size by which the end of its visible part is uncertain
+PERSISTENT = 3  # sightings in a row that must be larger than a box before it grows
 STEERED = 3.0  # standard deviations of the speed above which a heading is that of the velocity
-VELOCITY_DOUBT = 9.0  # squared standard deviations; a measured velocity farther off counts the less, the farther
+DOUBT = 9.0  # squared standard deviations; a measurement farther off counts the less, the farther
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,8 @@ class Track:
     Attributes:
         number: never given twice. born, stamp, seen_at: seconds of its first sighting, of this state, of its last sighting.
         state: (4,) position of the box's centre and velocity. covariance: (4, 4).
-        heading: radians. extent: (2,) length and width of the box, metres. is_steered: the heading is that of a velocity.
+        heading: radians. extent: (2,) length and width of the box, metres. excess: (2,) of its last sightings beyond it.
+        is_steered: the heading is that of a velocity.
         points: (n, 2) as last seen, in the world. seen_from: (2,) the centre then.
         history: whether it was seen, in its last scans.
         is_confirmed: whether it is more than a guess.
@@ -106,6 +109,7 @@ class Track:
     covariance: Floats
     heading: float
     extent: Floats
+    excess: tuple[Floats, ...]
     is_steered: bool
     points: Floats
     seen_from: Floats
@@ -115,15 +119,14 @@ class Track:
     @classmethod
     def born_of(cls, number: int, stamp: float, sighting: Sighting, config: TrackerConfig) -> Track:
         """A new track of a sighting, confirmed at once if the evidence is strong."""
-        speed, deviation = float(np.hypot(*sighting.velocity)), _deviation(sighting.covariance)
-        is_strong = len(sighting.points) >= config.strong_points and speed > config.strong_speed * deviation
-        covariance = np.zeros((4, 4))
-        covariance[:2, :2], covariance[2:, 2:] = sighting.noise**2 * np.eye(2), sighting.covariance
+        strength = kalman.chi_square(sighting.velocity, sighting.covariance)
+        is_strong = len(sighting.points) >= config.strong_points and strength > config.strong_speed**2
         centre = sighting.points.mean(0)
-        state = np.concatenate([centre, sighting.velocity])
+        unmoved = np.concatenate([centre, np.zeros(2)]), np.diag([sighting.noise**2] * 2 + [UNKNOWN_SPEED**2] * 2)
+        state, covariance = kalman.update(*unmoved, sighting.velocity, np.eye(4)[2:], sighting.covariance)
         heading = _main_axis(sighting.points)
-        is_confirmed = is_strong or config.sightings == 1
-        unboxed = np.zeros(2), False, sighting.points, centre, (True,), is_confirmed
+        is_confirmed = bool(is_strong) or config.sightings == 1
+        unboxed = np.zeros(2), (), False, sighting.points, centre, (True,), is_confirmed
         return cls(number, stamp, stamp, stamp, state, covariance, heading, *unboxed)._boxed(config)
 
     @property
@@ -145,25 +148,32 @@ class Track:
         """The track, predicted to the time of a sighting, after it. sensor: (2,) position in the world."""
         axes = se2.rotate(np.full(2, self.heading), np.eye(2))  # (2, 2) rows: along and across
         eye = None if sensor is None else axes @ (sensor - self.centre)
-        view = box.look(box.cover(sighting.points, self.centre, self.heading), self.extent, eye, sighting.noise)
-        state, covariance = self._corrected(view, axes, sighting)
-        state[:2] += view.drift @ axes
-        moved = replace(self, state=state, covariance=covariance, extent=self.extent + view.growth, points=sighting.points)
+        covered = box.cover(sighting.points, self.centre, self.heading)
+        noise = np.hypot(sighting.noise, PARTIAL * np.maximum(self.extent, covered.size))
+        view = box.look(covered, self.extent, eye, noise)
+        state, covariance = self._corrected(view, axes, sighting, noise)
+        excess = (*self.excess, view.excess)[-PERSISTENT:]
+        growth = box.GROWTH * np.min(excess, axis=0) if len(excess) == PERSISTENT else np.zeros(2)
+        state[:2] += view.side * growth / 2 @ axes
+        extent = self.extent + growth
+        moved = replace(self, state=state, covariance=covariance, extent=extent, excess=excess, points=sighting.points)
         history = (*self.history, True)[-config.among :]
         is_confirmed = self.is_confirmed or sum(history) >= config.sightings
         turned = moved._turned(config)
         return replace(turned, seen_at=self.stamp, seen_from=turned.centre, history=history, is_confirmed=is_confirmed)
 
-    def _corrected(self, view: box.View, axes: Floats, sighting: Sighting) -> tuple[Floats, Floats]:
-        """State and covariance after what was observed of the position, and the velocity."""
+    def _corrected(self, view: box.View, axes: Floats, sighting: Sighting, noise: Floats) -> tuple[Floats, Floats]:
+        """State and covariance after what was observed of the position, with `noise` (2,) along and across, and the velocity."""
         ahead = np.zeros((2, 4))
         ahead[:, :2] = axes
         still = np.eye(4)[2:]
-        doubt = velocity_doubt(sighting.velocity - self.velocity, self.covariance[2:, 2:] + sighting.covariance)
+        expected = axes @ self.covariance[:2, :2] @ axes.T
+        strayed = doubt(view.shift[:, None], (np.diag(expected) + noise**2)[:, None, None])
+        turned = doubt(sighting.velocity - self.velocity, self.covariance[2:, 2:] + sighting.covariance)
         rows = [*np.flatnonzero(view.is_seen), 2, 3]
         innovation = np.concatenate([view.shift, sighting.velocity - self.velocity])
         R = np.zeros((4, 4))
-        R[:2, :2], R[2:, 2:] = sighting.noise**2 * np.eye(2), sighting.covariance * doubt
+        R[:2, :2], R[2:, 2:] = np.diag(noise**2 * strayed), sighting.covariance * turned
         H = np.concatenate([ahead, still])
         return kalman.update(self.state, self.covariance, innovation[rows], H[rows], R[np.ix_(rows, rows)])
 
@@ -206,9 +216,9 @@ class Track:
         return MovingObject(self.number, self.centre, self.velocity, self.covariance, self.heading, extent, points, age)
 
 
-def velocity_doubt(innovation: Floats, S: Floats) -> Floats:
-    """(...,) factor, at least 1, on the covariance of a measured velocity that is implausibly far off. innovation: (..., 2)."""
-    return np.maximum(kalman.chi_square(innovation, S) / VELOCITY_DOUBT, 1.0) ** 2
+def doubt(innovation: Floats, S: Floats) -> Floats:
+    """(...,) factor, at least 1, on the covariance of a measurement that is implausibly far off. innovation: (..., M)."""
+    return np.maximum(kalman.chi_square(innovation, S) / DOUBT, 1.0) ** 2
 
 
 def _deviation(covariance: Floats) -> float:
