@@ -14,9 +14,10 @@ from torchcrf_scan.scan import Floats
 from torchcrf_scan.stream import extent as box
 from torchcrf_scan.stream import filter as kalman
 
-UNKNOWN_SPEED = 5.0  # m/s, standard deviation of a velocity that was not observed
+UNKNOWN_SPEED = 8.0  # m/s, standard deviation of a velocity that was not observed
 LONE_SPACING = 0.1  # metres, of an object of one point
 PARTIAL = 0.05  # share of an object's size by which the end of its visible part is uncertain
+APART = 0.7, 4.0  # metres, and times the spacing of its points, between neighbours that are not of the same piece
 PERSISTENT = 3  # sightings in a row that must be larger than a box before it grows
 STEERED = 3.0  # standard deviations of the speed above which a heading is that of the velocity
 DOUBT = 9.0  # squared standard deviations; a measurement farther off counts the less, the farther
@@ -61,7 +62,8 @@ class Sighting:
     """A moving cluster of one scan, in the world.
 
     Attributes:
-        points: (n, 2), n > 0. velocity: (2,) over ground. covariance: (2, 2) of it; large where it was not observed.
+        points: (n, 2), n > 0, in the order of beams. velocity: (2,) over ground. covariance: (2, 2) of it; large where it was
+            not observed.
         noise: standard deviation of where its points end, metres.
     """
 
@@ -80,6 +82,13 @@ class Sighting:
             return cls(points, np.zeros(2), UNKNOWN_SPEED**2 * np.eye(2), noise)
         floor = config.velocity_noise**2 * np.eye(2)
         return cls(points, velocity, (covariance + covariance.T) / 2 + floor, noise)
+
+    def pieces(self) -> list[Sighting]:
+        """Its pieces that lie apart, the one of most points first: what was not one thing, or what hides in part."""
+        gaps = np.hypot(*np.diff(self.points, axis=0).T)
+        apart = max(APART[0], APART[1] * float(np.median(gaps))) if len(gaps) else 0.0
+        parts = np.split(self.points, np.flatnonzero(gaps > apart) + 1)
+        return [replace(self, points=part) for part in sorted(parts, key=len, reverse=True)]
 
     def joined(self, other: Sighting) -> Sighting:
         """Both as one object; the velocity is that of the one with more points."""
@@ -188,8 +197,8 @@ class Track:
         return self.is_lost(config) or self.stamp - self.seen_at > config.lifetime
 
     def is_lost(self, config: TrackerConfig) -> bool:
-        """Whether its position is too uncertain to find it again."""
-        return _deviation(self.covariance[:2, :2]) > config.loss
+        """Whether its position is too uncertain to find it again; after a single sighting it always is uncertain."""
+        return len(self.history) > 1 and _deviation(self.covariance[:2, :2]) > config.loss
 
     def _turned(self, config: TrackerConfig) -> Track:
         """With the heading of the velocity, if it is certain; the first time, the box is fitted anew."""

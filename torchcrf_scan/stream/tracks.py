@@ -40,7 +40,8 @@ class Tracker:
     """Follows moving objects from scan to scan.
 
     A cluster continues the track whose predicted motion and extent it fits best; others begin new tracks, which count as objects
-    once they are seen repeatedly, or at once when much speaks for them. An object that is not seen is predicted for a while.
+    once they are seen repeatedly, or at once when much speaks for them. An object that is not seen is predicted for a while. The
+    pieces of a cluster that lie apart may belong to several tracks; what they do not continue is ignored, but for the largest.
     Memory is bounded by the tracks alive, and these by the clusters of the scans of one `lifetime`.
 
     A stamp that stands still or goes back adds a sighting without motion; one that goes back by more than `lifetime` ends all
@@ -97,17 +98,13 @@ class Tracker:
         labels = [k for k in range(1, len(velocities) + 1) if (cluster == k).any()]
         sightings = [Sighting.of(points[cluster == k], velocities[k - 1], covariances[k - 1], self.config) for k in labels]
         tracks = self._at(stamp)
-        found, numbers = self._matched(tracks, sightings, stamp)
+        found, numbers = self._matched(tracks, sightings)
         after = [
             track.seen(found[track.number], sensor, self.config) if track.number in found else track.missed(self.config)
             for track in tracks
         ]
         after = [track for track in after if track.number in found or not track.is_over(self.config)]
-        born = [
-            Track.born_of(numbers[place], stamp, of, self.config)
-            for place, of in enumerate(sightings)
-            if numbers[place] not in found
-        ]
+        born = [Track.born_of(n, stamp, of, self.config) for n, of in zip(numbers, sightings, strict=True) if n not in found]
         self._tracks, self._stamp = [*after, *born], stamp
         seen = {number: len(of.points) for number, of in found.items()} | {of.number: len(of.points) for of in born}
         objects = tuple(of.to_object(seen.get(of.number, 0)) for of in self._tracks if of.is_confirmed)
@@ -121,23 +118,22 @@ class Tracker:
             return []
         return [of for of in (track.at(stamp, self.config) for track in self._tracks) if not of.is_lost(self.config)]
 
-    def _matched(
-        self, tracks: Sequence[Track], sightings: Sequence[Sighting], stamp: float
-    ) -> tuple[dict[int, Sighting], list[int]]:
+    def _matched(self, tracks: Sequence[Track], sightings: Sequence[Sighting]) -> tuple[dict[int, Sighting], list[int]]:
         """The sighting of each track seen, by its number, and the track number of every sighting, new ones included."""
-        if not tracks or not sightings:
-            return {}, [self._next_number() for _ in sightings]
-        beside = Comparison(tracks, sightings, self.config)
-        pairs = {k: i for i, k in assign(beside.cost)}
-        found = {tracks[i].number: sightings[k] for k, i in pairs.items()}
-        numbers = [tracks[pairs[k]].number if k in pairs else 0 for k in range(len(sightings))]
-        for k in range(len(sightings)):
-            if k not in pairs:
-                parts = [tracks[i].number for i in sorted(pairs.values()) if beside.is_part[i, k]]
-                numbers[k] = parts[0] if parts else self._next_number()
-                if parts:  # an object in pieces
-                    found[parts[0]] = found[parts[0]].joined(sightings[k])
-        return found, numbers
+        pieces = [(k, piece) for k, of in enumerate(sightings) for piece in of.pieces()]
+        found, numbers = {}, [0] * len(pieces)
+        if tracks and pieces:
+            beside = Comparison(tracks, [piece for _, piece in pieces], self.config)
+            for i, p in assign(beside.cost):
+                numbers[p] = tracks[i].number
+                found[tracks[i].number] = pieces[p][1]
+            for p in np.flatnonzero(np.array(numbers) == 0).tolist():
+                inside = [track.number for track, is_part in zip(tracks, beside.is_part[:, p], strict=True) if is_part]
+                numbers[p] = next((number for number in inside if number in found), 0)
+                if numbers[p]:  # an object in pieces
+                    found[numbers[p]] = found[numbers[p]].joined(pieces[p][1])
+        firsts = [next(p for p, (of, _) in enumerate(pieces) if of == k) for k in range(len(sightings))]
+        return found, [numbers[p] or self._next_number() for p in firsts]
 
     def _next_number(self) -> int:
         self._born += 1
