@@ -11,7 +11,10 @@ from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.features.learned import ExtraLogUnary
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
 from torchcrf_scan.prediction import Prediction
+from torchcrf_scan.result import MovingObject, ScanResult
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
+from torchcrf_scan.stream.config import StreamConfig
+from torchcrf_scan.stream.stream import ScanStream
 
 __version__ = "0.1.0"
 
@@ -24,10 +27,14 @@ __all__ = [
     "JointScanCRF",
     "MatchingCRF",
     "ModelConfig",
+    "MovingObject",
     "PairPrediction",
     "Prediction",
     "Scan",
     "ScanPair",
     "ScanPairBatch",
+    "ScanResult",
+    "ScanStream",
+    "StreamConfig",
     "__version__",
 ]

@@ -124,8 +124,9 @@ class GradientConfig:
     """First-order training from the weights of the staged fit or of `init`: AdamW on pairs that are generated on the fly.
 
     Attributes:
-        objective: loss of the steps: `pseudo_likelihood`, `likelihood` (exact, of each chain at the start's motions) or
-            `unrolled`; `none`: staged fit only. With `learning.objective` unrolled it is `unrolled`.
+        objective: loss of the steps: `pseudo_likelihood`, `likelihood` (exact, of each chain at the start's motions),
+            `unrolled`, or `mixed`, the mean of the last two; `none`: staged fit only. With `learning.objective` unrolled it is
+            `unrolled`.
         steps: maximum number of optimiser steps.
         batch_size: pairs of a step, of all processes together.
         part: pairs processed at once; a step's parts are divided among the processes. Divides `batch_size`.

@@ -1,0 +1,49 @@
+"""Time between scans, from stamps that may stand still, jump or go back."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import deque
+
+USUAL = 0.1  # seconds between scans, before any is known
+REMEMBERED = 15  # intervals of which the median is the usual one
+
+log = logging.getLogger(__name__)
+
+
+class Clock:
+    """A time that always advances: by the stamps where they do, else by the usual interval.
+
+    Attributes:
+        now: seconds since the first scan.
+    """
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self._last = math.nan
+        self._intervals: deque[float] = deque(maxlen=REMEMBERED)
+        self._has_started = self._has_warned = False
+
+    @property
+    def usual(self) -> float:
+        """Seconds, the median of the last intervals."""
+        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else USUAL
+
+    def advance(self, stamp: float) -> float:
+        """Seconds since the scan before, above 0; 0 at the first scan. stamp: seconds, of the new scan."""
+        since = stamp - self._last
+        interval = since if since > 0 else self.usual  # a stamp that is not finite compares as false
+        if not self._has_started:
+            interval = 0.0
+        elif 0 < since < math.inf:
+            self._intervals.append(since)
+        elif not self._has_warned and not math.isnan(self._last):
+            self._has_warned = True
+            log.warning("stamp %s after %s: expected a later one; taken as %.3g s later", stamp, self._last, interval)
+        if not math.isfinite(interval):
+            interval = self.usual
+        self._has_started = True
+        self._last = stamp if math.isfinite(stamp) else math.nan
+        self.now += interval
+        return interval

@@ -1,0 +1,36 @@
+"""Settings of a stream of scans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from torchcrf_scan.checks import Amount, Share, Within, check_fields
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """Settings of `ScanStream`; the defaults serve robots, cars and standing sensors alike.
+
+    Attributes:
+        lag: seconds; a scan is matched to the newest one that is at least so much older: in less time nothing moves visibly.
+        history: number of scans kept to match to.
+        keyframe_share: a keyframe is replaced when it explains less than this share of a scan's background,
+        keyframe_distance: or is this many metres away,
+        keyframe_turn: or this many radians.
+        least_share: of the returns that a motion must explain; otherwise the scan is not placed.
+        gap: seconds without a placed scan after which the stream starts anew from the predicted pose.
+        deskew: scans with beam times are corrected for the motion during their sweep.
+    """
+
+    lag: Amount = 0.15
+    history: Annotated[int, Within(1, 1000)] = 32
+    keyframe_share: Share = 0.7
+    keyframe_distance: Amount = 3.0
+    keyframe_turn: Amount = 1.0
+    least_share: Share = 0.2
+    gap: Annotated[float, Within(0, above=True)] = 2.0
+    deskew: bool = True
+
+    def __post_init__(self) -> None:
+        check_fields(self)

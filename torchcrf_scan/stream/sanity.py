@@ -1,0 +1,52 @@
+"""A motion is never believed unchecked: not if another one explains far more returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, Ints
+from torchcrf_scan.search.background import refine
+from torchcrf_scan.search.grid import ScanGrid
+from torchcrf_scan.search.leftover import leftover_of
+from torchcrf_scan.stream.placement import TIGHT
+
+LEAST_OF_BEST = 0.6  # of the returns that the best candidate explains
+
+
+@dataclass(frozen=True, slots=True)
+class Backed:
+    """A background motion and the returns that it explains.
+
+    Attributes:
+        motion: (3,). explained: (P,) bool. share: of the returns of either scan, the lower one: a hand before the sensor fits onto
+            any wall, and explains nothing of the room. is_found: the motion is the one that the match found.
+    """
+
+    motion: Floats
+    explained: Bools
+    share: float
+    is_found: bool
+
+
+def choose_background(found: Floats, guess: Floats, grid: ScanGrid, reference: ScanGrid) -> Backed:
+    """The motion found (3,), unless the guess (3,) or standing still explain far more returns."""
+    first = _backed(found, grid, reference, True)
+    if first.share >= LEAST_OF_BEST:  # no candidate explains more than all
+        return first
+    starts = np.stack([guess, np.zeros(3)])
+    others = [_backed(motion, grid, reference, False) for motion in (*starts, *refine(starts, grid, reference))]
+    best = max(others, key=lambda backed: backed.share)
+    return first if first.share >= LEAST_OF_BEST * best.share else best
+
+
+def _backed(motion: Floats, grid: ScanGrid, reference: ScanGrid, is_found: bool) -> Backed:
+    left = leftover_of(grid, reference, motion)
+    explained, back = (side.residual < TIGHT for side in (left.source, left.target))
+    return Backed(motion, explained, float(min(explained.mean(), back.mean())), is_found)
+
+
+def labels_without_match(backed: Backed) -> Ints:
+    """(P,) what a motion explains is background, all else unknown."""
+    return np.where(backed.explained, BACKGROUND, OUTLIER)
