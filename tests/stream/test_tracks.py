@@ -74,15 +74,15 @@ def test_an_object_hidden_for_some_scans_is_predicted_and_found_again() -> None:
 
 def test_an_object_that_is_gone_is_given_up_and_its_number_never_given_again() -> None:
     car = Body((-8.0, 5.0), (5.0, 1.0))
-    numbers, objects = drive([car], 40, np.random.default_rng(3), range(5, 20))
-    assert objects[19] == ()
-    assert {row[0] for row in numbers[20:]} == {2}
+    numbers, objects = drive([car], 40, np.random.default_rng(3), range(5, 24))
+    assert objects[23] == ()
+    assert {row[0] for row in numbers[24:]} == {2}
 
 
 def test_a_guess_becomes_an_object_when_it_is_seen_again() -> None:
     walker = [Body((-3.0, 4.0), (0.8, 0.0), (0.3, 0.3))]
     numbers, objects = drive(walker, 4, np.random.default_rng(0), speed_noise=0.3)
-    assert [len(known) for known in objects] == [0, 0, 1, 1]
+    assert [len(known) for known in objects] == [0, 1, 1, 1]
     assert [row[0] for row in numbers] == [1, 1, 1, 1]
     numbers, objects = drive(walker, 12, np.random.default_rng(0), range(1, 11), speed_noise=0.3)
     assert objects == [()] * 12
@@ -106,6 +106,33 @@ def test_an_object_in_two_pieces_has_one_number() -> None:
         assert set(numbers) == {1}
         assert len(objects) == 1
         assert objects[0].points == len(scan["points"])
+
+
+def test_points_that_lie_apart_from_the_rest_of_a_cluster_belong_to_no_extent() -> None:
+    car, tracker, rng = Body((-8.0, 3.0), (6.0, 0.0)), Tracker(), np.random.default_rng(0)
+    for i in range(15):
+        scan = sight([car], DT * i, rng)
+        stray = np.array([[5.0, -20.0], [30.0, 4.0]])
+        scan |= {"points": np.concatenate([scan["points"], stray]), "cluster": np.append(scan["cluster"], [1, 1])}
+        numbers, objects = tracker.update(DT * i, **scan)
+        assert numbers.tolist() == [1]
+        assert [of.number for of in objects] == [1]
+        assert (np.array(objects[0].extent) < [4.6, 2.4]).all()
+
+
+def test_two_objects_in_one_cluster_keep_their_numbers() -> None:
+    pair = [Body((-6.0, 3.0), (3.0, 0.0), (0.5, 0.5)), Body((-8.0, 3.0), (3.0, 0.0), (0.5, 0.5))]
+    tracker, rng = Tracker(), np.random.default_rng(0)
+    for i in range(12):
+        scan = sight(pair, DT * i, rng)
+        if i >= 6:
+            scan |= {"cluster": np.minimum(scan["cluster"], 1), "velocities": scan["velocities"][:1]}
+            scan |= {"covariances": scan["covariances"][:1]}
+        _, objects = tracker.update(DT * i, **scan)
+    assert [of.number for of in objects] == [1, 2]
+    for of, body in zip(objects, pair, strict=True):
+        np.testing.assert_allclose(of.position, body.centre(1.1), atol=0.2)
+        assert of.points > 0
 
 
 def test_errors_have_the_covariance_that_is_stated() -> None:
@@ -200,7 +227,7 @@ def test_memory_does_not_grow() -> None:
     for i in range(200):
         points = rng.uniform(-20, 20, (10, 2))
         tracker.update(DT * i, points, np.repeat([1, 2], 5), rng.normal(0, 5, (2, 2)), np.tile(0.01 * np.eye(2), (2, 1, 1)))
-        assert len(tracker.predict(DT * i)) <= 2 * 11
+        assert len(tracker.predict(DT * i)) <= 2 * 16
 
 
 def test_predictions_change_nothing_and_tell_how_far_the_points_have_moved() -> None:
@@ -248,8 +275,8 @@ def test_wrong_arguments_are_named(change: dict, message: str) -> None:
 
 
 def test_settings_that_contradict_each_other() -> None:
-    with pytest.raises(ValueError, match="among: expected at least sightings = 3, got 2"):
-        TrackerConfig(among=2)
+    with pytest.raises(ValueError, match="among: expected at least sightings = 2, got 1"):
+        TrackerConfig(among=1)
 
 
 def test_a_sighting_of_one_point_has_a_noise() -> None:

@@ -16,7 +16,7 @@ from torchcrf_scan.stream import filter as kalman
 
 UNKNOWN_SPEED = 8.0  # m/s, standard deviation of a velocity that was not observed
 LONE_SPACING = 0.1  # metres, of an object of one point
-PARTIAL = 0.05  # share of an object's size by which the end of its visible part is uncertain
+PARTIAL = 0.1  # share of an object's size by which the end of its visible part is uncertain
 APART = 0.7, 4.0  # metres, and times the spacing of its points, between neighbours that are not of the same piece
 PERSISTENT = 3  # sightings in a row that must be larger than a box before it grows
 STEERED = 3.0  # standard deviations of the speed above which a heading is that of the velocity
@@ -39,15 +39,15 @@ class TrackerConfig:
         least_speed: m/s, below which a heading is kept.
     """
 
-    acceleration: Positive = 1.0
+    acceleration: Positive = 1.5
     range_noise: Positive = 0.02
     velocity_noise: Positive = 0.05
     gate: Positive = 20.0
-    sightings: Annotated[int, Within(1, 100)] = 3
-    among: Annotated[int, Within(1, 100)] = 5
+    sightings: Annotated[int, Within(1, 100)] = 2
+    among: Annotated[int, Within(1, 100)] = 4
     strong_points: Annotated[int, Within(1)] = 12
-    strong_speed: Positive = 8.0
-    lifetime: Amount = 1.0
+    strong_speed: Positive = 6.0
+    lifetime: Amount = 1.5
     loss: Positive = 2.0
     least_speed: Amount = 0.1
 

@@ -104,9 +104,10 @@ class Tracker:
             for track in tracks
         ]
         after = [track for track in after if track.number in found or not track.is_over(self.config)]
-        born = [Track.born_of(n, stamp, of, self.config) for n, of in zip(numbers, sightings, strict=True) if n not in found]
+        first = {n: of.pieces()[0] for n, of in zip(numbers, sightings, strict=True) if n not in found}
+        born = [Track.born_of(n, stamp, of, self.config) for n, of in first.items()]
         self._tracks, self._stamp = [*after, *born], stamp
-        seen = {number: len(of.points) for number, of in found.items()} | {of.number: len(of.points) for of in born}
+        seen = {number: len(of.points) for number, of in (found | first).items()}
         objects = tuple(of.to_object(seen.get(of.number, 0)) for of in self._tracks if of.is_confirmed)
         of_cluster = np.zeros(len(velocities), dtype=np.int64)
         of_cluster[[k - 1 for k in labels]] = numbers
