@@ -135,6 +135,28 @@ def test_two_objects_in_one_cluster_keep_their_numbers() -> None:
         assert of.points > 0
 
 
+def test_two_legs_are_one_object_however_they_are_clustered() -> None:
+    legs = [Body((-3.0, 4.0), (1.2, 0.0), (0.15, 0.12)), Body((-3.0, 4.25), (1.2, 0.0), (0.15, 0.12))]
+    tracker, rng = Tracker(), np.random.default_rng(0)
+    for i in range(20):
+        scan = sight(legs, DT * i, rng)
+        swing = 0.5 * np.sin(2 * i)
+        scan["velocities"] += np.array([[swing, 0.0], [-swing, 0.0]])
+        if i % 3 == 1:
+            scan["cluster"] = np.where(scan["cluster"] == 2, 0, scan["cluster"])
+        numbers, objects = tracker.update(DT * i, **scan)
+        assert set(numbers) <= {0, 1}
+        assert [of.number for of in objects] in ([], [1])
+    np.testing.assert_allclose(objects[0].velocity, [1.2, 0.0], atol=0.5)
+
+
+def test_two_who_meet_are_two() -> None:
+    pair = [Body((-1.0, 4.0), (1.0, 0.0), (0.15, 0.15)), Body((1.0, 4.4), (-1.0, 0.0), (0.15, 0.15))]
+    numbers, objects = drive(pair, 20, np.random.default_rng(0))
+    assert all(row[0] in (0, 1) and row[1] in (0, 2) for row in numbers)
+    assert [of.number for of in objects[-1]] == [1, 2]
+
+
 def test_errors_have_the_covariance_that_is_stated() -> None:
     nees = []
     for seed in range(12):

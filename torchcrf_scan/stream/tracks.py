@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from torchcrf_scan.result import MovingObject
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints
-from torchcrf_scan.stream.assignment import Comparison, assign
+from torchcrf_scan.stream.assignment import Comparison, assign, twins
 from torchcrf_scan.stream.track import Sighting, Track, TrackerConfig
 
 
@@ -106,12 +107,14 @@ class Tracker:
         after = [track for track in after if track.number in found or not track.is_over(self.config)]
         first = {n: of.pieces()[0] for n, of in zip(numbers, sightings, strict=True) if n not in found}
         born = [Track.born_of(n, stamp, of, self.config) for n, of in first.items()]
-        self._tracks, self._stamp = [*after, *born], stamp
-        seen = {number: len(of.points) for number, of in (found | first).items()}
-        objects = tuple(of.to_object(seen.get(of.number, 0)) for of in self._tracks if of.is_confirmed)
+        same = twins([*after, *born])
+        self._tracks, self._stamp = [of for of in (*after, *born) if of.number not in same], stamp
+        seen: Counter[int] = Counter()
+        for number, of in (found | first).items():
+            seen[same.get(number, number)] += len(of.points)
         of_cluster = np.zeros(len(velocities), dtype=np.int64)
-        of_cluster[[k - 1 for k in labels]] = numbers
-        return of_cluster, objects
+        of_cluster[[k - 1 for k in labels]] = [same.get(number, number) for number in numbers]
+        return of_cluster, tuple(of.to_object(seen[of.number]) for of in self._tracks if of.is_confirmed)
 
     def _at(self, stamp: float) -> list[Track]:
         """The tracks predicted to a time, without those that it ends."""
