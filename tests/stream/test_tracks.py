@@ -302,5 +302,5 @@ def test_settings_that_contradict_each_other() -> None:
 
 
 def test_a_sighting_of_one_point_has_a_noise() -> None:
-    lone = Sighting.of(np.zeros((1, 2)), np.zeros(2), np.eye(2), TrackerConfig())
+    lone = Sighting.of(np.zeros((1, 2)), np.zeros(2), np.eye(2), 0.0, 0.0, TrackerConfig())
     assert lone.noise > TrackerConfig().range_noise

@@ -15,6 +15,7 @@ from torchcrf_scan.stream import extent as box
 from torchcrf_scan.stream import filter as kalman
 
 UNKNOWN_SPEED = 8.0  # m/s, standard deviation of a velocity that was not observed
+SLIDE = 2.0  # spacings, standard deviation of how far a shape may have slid along itself
 LONE_SPACING = 0.1  # metres, of an object of one point
 PARTIAL = 0.1  # share of an object's size by which the end of its visible part is uncertain
 APART = 0.7, 4.0  # metres, and times the spacing of its points, between neighbours that are not of the same piece
@@ -64,24 +65,37 @@ class Sighting:
     Attributes:
         points: (n, 2), n > 0, in the order of beams. velocity: (2,) over ground. covariance: (2, 2) of it; large where it was
             not observed.
-        noise: standard deviation of where its points end, metres.
+        turn: rad/s, of its rotation. noise: standard deviation of where its points end, metres.
     """
 
     points: Floats
     velocity: Floats
     covariance: Floats
+    turn: float
     noise: float
 
     @classmethod
-    def of(cls, points: Floats, velocity: Floats, covariance: Floats, config: TrackerConfig) -> Sighting:
-        """A velocity or covariance that is not finite or not positive counts as not observed."""
+    def of(cls, points: Floats, velocity: Floats, covariance: Floats, since: float, turn: float, config: TrackerConfig) -> Sighting:
+        """A velocity or covariance that is not finite or not positive counts as not observed, a turn that is not finite as none.
+
+        since: seconds over which the velocity was measured. A shape that slid by more than the spacing of its points in that time
+        would show other ends; this bounds the velocity's uncertainty where the shape itself tells nothing.
+        """
         spacing = float(np.median(np.hypot(*np.diff(points, axis=0).T))) if len(points) > 1 else LONE_SPACING
         noise = float(np.hypot(config.range_noise, min(spacing, 1.0) / 2))
+        turn = turn if np.isfinite(turn) else 0.0
         is_right = np.isfinite(velocity).all() and np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] >= 0
         if not is_right:
-            return cls(points, np.zeros(2), UNKNOWN_SPEED**2 * np.eye(2), noise)
-        floor = config.velocity_noise**2 * np.eye(2)
-        return cls(points, velocity, (covariance + covariance.T) / 2 + floor, noise)
+            return cls(points, np.zeros(2), UNKNOWN_SPEED**2 * np.eye(2), turn, noise)
+        most = SLIDE * np.hypot(spacing, config.range_noise) / since if since > 0 else np.inf
+        values, axes = np.linalg.eigh(covariance + config.velocity_noise**2 * np.eye(2))
+        bounded = axes @ np.diag(1 / (1 / values + 1 / most**2)) @ axes.T
+        return cls(points, velocity, bounded, turn, noise)
+
+    def velocity_at(self, place: Floats) -> Floats:
+        """(2,) the velocity of the object where its centre is, which differs from that of its visible points as it turns."""
+        x, y = place - self.points.mean(0)
+        return self.velocity + self.turn * np.array([-y, x])
 
     def pieces(self) -> list[Sighting]:
         """Its pieces that lie apart, the one of most points first: what was not one thing, or what hides in part."""
@@ -178,9 +192,10 @@ class Track:
         still = np.eye(4)[2:]
         expected = axes @ self.covariance[:2, :2] @ axes.T
         strayed = doubt(view.shift[:, None], (np.diag(expected) + noise**2)[:, None, None])
-        turned = doubt(sighting.velocity - self.velocity, self.covariance[2:, 2:] + sighting.covariance)
+        change = sighting.velocity_at(self.centre) - self.velocity
+        turned = doubt(change, self.covariance[2:, 2:] + sighting.covariance)
         rows = [*np.flatnonzero(view.is_seen), 2, 3]
-        innovation = np.concatenate([view.shift, sighting.velocity - self.velocity])
+        innovation = np.concatenate([view.shift, change])
         R = np.zeros((4, 4))
         R[:2, :2], R[2:, 2:] = np.diag(noise**2 * strayed), sighting.covariance * turned
         H = np.concatenate([ahead, still])

@@ -80,6 +80,8 @@ class Tracker:
         velocities: Floats,
         covariances: Floats,
         sensor: Floats | None = None,
+        since: float = 0.0,
+        turns: Floats | None = None,
     ) -> tuple[Ints, tuple[MovingObject, ...]]:
         """Takes a scan.
 
@@ -88,6 +90,8 @@ class Tracker:
             points: (N, 2) in the world. cluster: (N,) 0 background, k >= 1 mover k, -1 outlier.
             velocities: (K, 2) of the movers over ground, m/s. covariances: (K, 2, 2). NaN: not observed.
             sensor: (2,) its position in the world, which tells the faces it sees; None: not known.
+            since: seconds over which the velocities were measured; 0: not known.
+            turns: (K,) rad/s, at which the movers rotate; the velocities are those of the middle of their points. NaN: not known.
 
         Returns:
             (K,) the number of each mover's track, 0 for a mover without points, and the confirmed objects by number.
@@ -97,7 +101,11 @@ class Tracker:
         """
         points, cluster, velocities, covariances = _checked(stamp, points, cluster, velocities, covariances)
         labels = [k for k in range(1, len(velocities) + 1) if (cluster == k).any()]
-        sightings = [Sighting.of(points[cluster == k], velocities[k - 1], covariances[k - 1], self.config) for k in labels]
+        rates = np.zeros(len(velocities)) if turns is None else turns
+        sightings = [
+            Sighting.of(points[cluster == k], velocities[k - 1], covariances[k - 1], since, float(rates[k - 1]), self.config)
+            for k in labels
+        ]
         tracks = self._at(stamp)
         found, numbers = self._matched(tracks, sightings)
         after = [
