@@ -180,6 +180,40 @@ def test_a_velocity_that_is_not_observed_follows_from_positions() -> None:
     np.testing.assert_allclose(objects[0].velocity, body.velocity, atol=0.4)
 
 
+def test_what_slides_along_itself_is_steered_by_its_ends() -> None:
+    body, rng, tracker = Body((-4.0, 3.0), (2.0, 0.0)), np.random.default_rng(0), Tracker()
+    unseen = np.diag([400.0, 0.01])[None]  # a side seen from beside tells nothing of the motion along it
+    for i in range(12):
+        scan = sight([body], DT * i, rng) | {"covariances": unseen}
+        _, loose = tracker.update(DT * i, **scan)
+    assert loose[0].covariance[2, 2] > 0.1
+    tracker = Tracker()
+    for i in range(12):
+        _, objects = tracker.update(DT * i, **sight([body], DT * i, rng) | {"covariances": unseen}, since=0.15)
+    assert objects[0].covariance[2, 2] < loose[0].covariance[2, 2]
+    assert abs(objects[0].heading) < 0.2
+
+
+def test_the_velocity_of_a_thing_that_turns_is_that_of_its_centre() -> None:
+    half = np.linspace(-2, 2, 21)
+    side = np.stack([half, np.full(21, -1.0)], axis=1)  # the right side of a car, 2 m wide
+    front = np.stack([np.full(11, 2.0), np.linspace(-1, 1, 11)], axis=1)
+    arguments = {"cluster": np.ones(32, dtype=np.int64), "covariances": 0.01 * np.eye(2)[None]}
+    points = np.concatenate([side, front])
+    arm = points.mean(0)
+    spun = np.array([3.0, 0.0]) + 0.5 * np.array([-arm[1], arm[0]])  # of the middle of the points, as it turns by 0.5 rad/s
+    found = []
+    for turns in (np.array([0.5]), np.array([np.nan]), None):
+        tracker = Tracker()
+        for i in range(8):
+            at = points + np.array([0.3 * i, 0.0])
+            _, objects = tracker.update(DT * i, at, velocities=spun[None], turns=turns, **arguments)
+        found.append(objects[0].velocity)
+    assert np.hypot(*(found[0] - [3.0, 0.0])) < 0.1
+    assert np.hypot(*(found[1] - [3.0, 0.0])) > 0.2
+    np.testing.assert_array_equal(found[1], found[2])
+
+
 def test_one_wrong_velocity_neither_ends_nor_turns_a_track() -> None:
     body, rng, tracker = Body((-4.0, 3.0), (2.0, 0.0)), np.random.default_rng(0), Tracker()
     for i in range(20):
@@ -294,6 +328,12 @@ def test_wrong_arguments_are_named(change: dict, message: str) -> None:
     right = {"stamp": 0.0, "points": np.zeros((2, 2)), "cluster": np.array([0, 1]), "velocities": np.zeros((1, 2))}
     with pytest.raises(ValueError, match=message):
         Tracker().update(**right | {"covariances": np.zeros((1, 2, 2))} | change)
+
+
+def test_turns_of_another_number_of_movers_are_refused() -> None:
+    arguments = np.zeros((2, 2)), np.array([0, 1]), np.zeros((1, 2)), np.zeros((1, 2, 2))
+    with pytest.raises(ValueError, match=r"turns: expected \(1,\), got \(2,\)"):
+        Tracker().update(0.0, *arguments, turns=np.zeros(2))
 
 
 def test_settings_that_contradict_each_other() -> None:

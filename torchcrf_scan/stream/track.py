@@ -15,12 +15,13 @@ from torchcrf_scan.stream import extent as box
 from torchcrf_scan.stream import filter as kalman
 
 UNKNOWN_SPEED = 8.0  # m/s, standard deviation of a velocity that was not observed
-SLIDE = 2.0  # spacings, standard deviation of how far a shape may have slid along itself
+SLIDE = 1.0  # spacings, standard deviation of how far a shape may have slid along itself
 LONE_SPACING = 0.1  # metres, of an object of one point
 PARTIAL = 0.1  # share of an object's size by which the end of its visible part is uncertain
 APART = 0.7, 4.0  # metres, and times the spacing of its points, between neighbours that are not of the same piece
 PERSISTENT = 3  # sightings in a row that must be larger than a box before it grows
-STEERED = 3.0  # standard deviations of the speed above which a heading is that of the velocity
+STEERED = 2.0  # standard deviations of the speed above which a heading is that of the velocity,
+ASTRAY = 0.5  # if that is known to so many radians
 DOUBT = 9.0  # squared standard deviations; a measurement farther off counts the less, the farther
 
 
@@ -217,21 +218,29 @@ class Track:
 
     def _turned(self, config: TrackerConfig) -> Track:
         """With the heading of the velocity, if it is certain; the first time, the box is fitted anew."""
-        speed = float(np.hypot(*self.velocity))
-        if speed < max(config.least_speed, STEERED * _deviation(self.covariance[2:, 2:])):
+        if not self._has_course(config):
             return self
         turned = replace(self, heading=float(np.arctan2(self.velocity[1], self.velocity[0])))
         return turned if self.is_steered else turned._boxed(config)
 
     def _boxed(self, config: TrackerConfig) -> Track:
         """With the box of its points alone, along the velocity if that is certain."""
-        speed = float(np.hypot(*self.velocity))
-        is_steered = speed >= max(config.least_speed, STEERED * _deviation(self.covariance[2:, 2:]))
+        is_steered = self._has_course(config)
         heading = float(np.arctan2(self.velocity[1], self.velocity[0])) if is_steered else self.heading
         seen = box.cover(self.points, self.centre, heading)
         centre = self.centre + se2.rotate(np.asarray(heading), seen.middle)
         state = np.concatenate([centre, self.velocity])
         return replace(self, state=state, heading=heading, extent=seen.size, is_steered=is_steered, seen_from=centre)
+
+    def _has_course(self, config: TrackerConfig) -> bool:
+        """Whether the direction of the velocity is certain."""
+        speed = float(np.hypot(*self.velocity))
+        if speed <= config.least_speed:
+            return False
+        ahead = self.velocity / speed
+        aside = np.array([-ahead[1], ahead[0]])
+        along, across = (float(np.sqrt(of @ self.covariance[2:, 2:] @ of)) for of in (ahead, aside))
+        return speed > STEERED * along and across < ASTRAY * speed
 
     def to_object(self, points: int) -> MovingObject:
         """As the result of a scan in which it has that many points."""

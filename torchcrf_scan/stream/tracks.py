@@ -101,7 +101,9 @@ class Tracker:
         """
         points, cluster, velocities, covariances = _checked(stamp, points, cluster, velocities, covariances)
         labels = [k for k in range(1, len(velocities) + 1) if (cluster == k).any()]
-        rates = np.zeros(len(velocities)) if turns is None else turns
+        rates = np.zeros(len(velocities)) if turns is None else np.asarray(turns, dtype=np.float64)
+        if rates.shape != (len(velocities),):
+            raise ValueError(f"turns: expected ({len(velocities)},), got {rates.shape}")
         sightings = [
             Sighting.of(points[cluster == k], velocities[k - 1], covariances[k - 1], since, float(rates[k - 1]), self.config)
             for k in labels
