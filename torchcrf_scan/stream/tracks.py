@@ -100,14 +100,23 @@ class Tracker:
             ValueError: a stamp or points that are not finite, shapes that do not fit each other, clusters beyond K.
         """
         points, cluster, velocities, covariances = _checked(stamp, points, cluster, velocities, covariances)
-        labels = [k for k in range(1, len(velocities) + 1) if (cluster == k).any()]
         rates = np.zeros(len(velocities)) if turns is None else np.asarray(turns, dtype=np.float64)
         if rates.shape != (len(velocities),):
             raise ValueError(f"turns: expected ({len(velocities)},), got {rates.shape}")
+        labels = [k for k in range(1, len(velocities) + 1) if (cluster == k).any()]
         sightings = [
             Sighting.of(points[cluster == k], velocities[k - 1], covariances[k - 1], since, float(rates[k - 1]), self.config)
             for k in labels
         ]
+        numbers, objects = self._taken(stamp, sightings, sensor)
+        of_cluster = np.zeros(len(velocities), dtype=np.int64)
+        of_cluster[[k - 1 for k in labels]] = numbers
+        return of_cluster, objects
+
+    def _taken(
+        self, stamp: float, sightings: Sequence[Sighting], sensor: Floats | None
+    ) -> tuple[list[int], tuple[MovingObject, ...]]:
+        """Follows the sightings of a scan; returns the track number of each, and the confirmed objects."""
         tracks = self._at(stamp)
         found, numbers = self._matched(tracks, sightings)
         after = [
@@ -122,9 +131,8 @@ class Tracker:
         seen: Counter[int] = Counter()
         for number, of in (found | first).items():
             seen[same.get(number, number)] += len(of.points)
-        of_cluster = np.zeros(len(velocities), dtype=np.int64)
-        of_cluster[[k - 1 for k in labels]] = [same.get(number, number) for number in numbers]
-        return of_cluster, tuple(of.to_object(seen[of.number]) for of in self._tracks if of.is_confirmed)
+        objects = tuple(of.to_object(seen[of.number]) for of in self._tracks if of.is_confirmed)
+        return [same.get(number, number) for number in numbers], objects
 
     def _at(self, stamp: float) -> list[Track]:
         """The tracks predicted to a time, without those that it ends."""
