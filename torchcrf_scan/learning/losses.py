@@ -35,5 +35,4 @@ LOSSES: Mapping[str, Loss] = {
     STAGED: Loss(function="learning.objectives:make_pseudo_likelihood", needs_start=False),
     "likelihood": Loss(function="learning.objectives:make_likelihood", is_exact=True),
     "unrolled": Loss(function="learning.unrolled:make_unrolled", is_staged=False, has_temperature=True),
-    "mixed": Loss(function="learning.unrolled:make_mixed", is_staged=False, has_temperature=True),
 }

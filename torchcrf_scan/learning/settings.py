@@ -124,9 +124,8 @@ class GradientConfig:
     """First-order training from the weights of the staged fit or of `init`: AdamW on pairs that are generated on the fly.
 
     Attributes:
-        objective: loss of the steps: `pseudo_likelihood`, `likelihood` (exact, of each chain at the start's motions),
-            `unrolled`, or `mixed`, the mean of the last two; `none`: staged fit only. With `learning.objective` unrolled it is
-            `unrolled`.
+        objective: loss of the steps: `pseudo_likelihood`, `likelihood` (exact, of each chain at the start's motions) or
+            `unrolled`; `none`: staged fit only. With `learning.objective` unrolled it is `unrolled`.
         steps: maximum number of optimiser steps.
         batch_size: pairs of a step, of all processes together.
         part: pairs processed at once; a step's parts are divided among the processes. Divides `batch_size`.
@@ -136,6 +135,8 @@ class GradientConfig:
         warmup: steps of linear increase to the maximal learning rate, which then decays along a cosine.
         final_rate: final learning rate as a share of the maximum.
         average: share of the steps, the last ones, whose mean weights are kept where nothing is validated; 0: the last weights.
+        trained_share: weight of the trained log potentials in their mean with the initial ones; 1: the trained ones alone. Less
+            holds better on data unlike the training worlds (Wortsman et al., Robust fine-tuning, 2022).
         clip: norm to which gradients are clipped; 0: no clipping.
         amp: bfloat16 on GPUs that support it (torch.autocast); CPUs always use full precision.
         device: `auto` (a GPU if there is one), `cpu` or `cuda`.
@@ -161,6 +162,7 @@ class GradientConfig:
     warmup: CountOrNone = 10
     final_rate: Share = 0.05
     average: Share = 0.0
+    trained_share: Share = 1.0
     clip: Amount = 1.0
     amp: bool = False
     device: Annotated[str, OneOf("auto", "cpu", "cuda")] = "auto"

@@ -24,7 +24,7 @@ from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import State
-from torchcrf_scan.learning.objectives import Objective, make_likelihood, start_of
+from torchcrf_scan.learning.objectives import Objective, start_of
 from torchcrf_scan.learning.portions import Portion
 from torchcrf_scan.learning.settings import Config, UnrolledConfig
 from torchcrf_scan.model import JointScanCRF
@@ -69,21 +69,6 @@ def make_unrolled(config: Config) -> Objective:
         return unrolled_loss(model, portion.batch, config.unrolled, start_of(model, portion))
 
     return unrolled
-
-
-def make_mixed(config: Config) -> Objective:
-    """The objective `mixed`: the mean of `unrolled` and `likelihood`.
-
-    The former alone learns nothing from a true mover that the present weights discard, and loses more of them.
-    """
-    unrolled, likelihood = make_unrolled(config), make_likelihood(config)
-
-    def mixed(model: JointScanCRF, portion: Portion) -> dict[str, Tensor]:
-        terms, others = unrolled(model, portion), likelihood(model, portion)
-        exact = {f"likelihood/{name}": value for name, value in others.items() if name != "total"}
-        return terms | exact | {"total": (terms["total"] + others["total"]) / 2}
-
-    return mixed
 
 
 def unrolled_loss(
