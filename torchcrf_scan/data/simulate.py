@@ -65,7 +65,10 @@ def _steer(start: Floats, world: World, pairs: int, speed: float, bend: float, l
 
 @dataclass
 class _Drive:
-    """A sequence under construction: the world, the sensor's path (T, 3) at `times` (T,), and the kinds of movers wanted."""
+    """A sequence under construction: the world, the sensor's path (T, 3) at `times` (T,), and the kinds of movers wanted.
+
+    A mover that has been out of sight for more than `patience` scans is replaced by a new one.
+    """
 
     config: SimulatorConfig
     rng: np.random.Generator
@@ -73,11 +76,13 @@ class _Drive:
     path: Floats
     times: Floats
     kinds: list[str]
+    patience: int = 0
     movers: dict[int, Mover] = field(default_factory=dict)  # by index in `kinds`
+    unseen: dict[int, int] = field(default_factory=dict)  # scans since it was seen, by number
     born: int = 0
 
     def capture(self, i: int) -> Capture:
-        """The scan at time i; movers that were not visible in the scan before (all, at first) are replaced by new ones."""
+        """The scan at time i; movers that were out of sight for too long (all, at first) are replaced by new ones."""
         config, rng = self.config, self.rng
         hits = self._cast(lambda _: self.world.shapes, STATIC, i)
         for mover in self.movers.values():
@@ -87,7 +92,8 @@ class _Drive:
                 hits = self._enter(place, kind, i, hits)
         movers = tuple(self.movers.values())
         scan, beam, body, spacing = measure(hits, config, rng)
-        self.movers = {place: mover for place, mover in self.movers.items() if (body == mover.number).any()}
+        self.unseen = {m.number: 0 if (body == m.number).any() else self.unseen.get(m.number, 0) + 1 for m in movers}
+        self.movers = {place: mover for place, mover in self.movers.items() if self.unseen[mover.number] <= self.patience}
         settled = self._settle(scan.points, beam, body, i, movers)
         return Capture(scan, body, spacing, settled, self.times[i], self.path[i], movers)
 
@@ -168,8 +174,8 @@ def _is_clear(mover: Mover, obstacles: tuple[Floats, Floats], times: Floats) -> 
     return not (np.abs(relative) < reach).all(-1).any()
 
 
-def _simulate_sequence(config: SimulatorConfig, pairs: int, rng: np.random.Generator) -> list[Capture]:
-    """The pairs + 1 scans of one drive."""
+def simulate_sequence(config: SimulatorConfig, pairs: int, rng: np.random.Generator, patience: int = 0) -> list[Capture]:
+    """The pairs + 1 scans of one drive. patience: scans for which a mover that is out of sight stays in the world."""
     n_movers = int(rng.integers(config.movers_min, config.movers_max, endpoint=True))
     special = [kind for kind, p in (("truck", config.dominant_mover), ("slider", config.aperture)) if rng.random() < p]
     kinds = (special + ["any"] * max(n_movers - len(special), 0))[: config.movers_max]
@@ -179,7 +185,7 @@ def _simulate_sequence(config: SimulatorConfig, pairs: int, rng: np.random.Gener
     world = build(rng, start, end, config.clutter)
     world = littered(rng, world, start, end, config.litter) if config.litter > 0 else world
     path = _ego_path(config, world, pairs, "truck" in kinds, rng)
-    drive = _Drive(config, rng, world, path, config.dt * np.arange(pairs + 1, dtype=np.float64), kinds)
+    drive = _Drive(config, rng, world, path, config.dt * np.arange(pairs + 1, dtype=np.float64), kinds, patience)
     return [drive.capture(i) for i in range(pairs + 1)]
 
 
@@ -201,7 +207,7 @@ def simulate_pairs(config: SimulatorConfig, pairs: int, sequences: int, seed: in
     simulated = []
     for s in range(sequences):
         length = pairs // sequences + (s < pairs % sequences)
-        captures = _simulate_sequence(config, length, np.random.default_rng([seed, s]))
+        captures = simulate_sequence(config, length, np.random.default_rng([seed, s]))
         for index, (source, target) in enumerate(pairwise(captures)):
             annotation = annotate(source, target, config)
             scans = source.scan, target.scan, config.dt, annotation

@@ -122,4 +122,13 @@ TRAINING_WORLDS = {  # named by scene and beams
     "still_indoor_360": without_movers(replace(INDOOR, beams=360, sweep=0.013)),
     "still_indoor_512": without_movers(replace(INDOOR, beams=512, fov=240.0, range_max=10.0, sweep=0.1)),
 }
+
+
+def every(config: SimulatorConfig, dt: float) -> SimulatorConfig:
+    """The same world and traffic, scanned every `dt` seconds; a sweep that would last longer is cut to that."""
+    share = dt / config.dt
+    travel, turn = share * config.ego_translation, min(share * config.ego_rotation, math.pi)
+    return replace(config, dt=dt, ego_translation=travel, ego_rotation=turn, sweep=min(config.sweep, dt))
+
+
 NAMED_WORLDS = WORLDS | TRAINING_WORLDS
