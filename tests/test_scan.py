@@ -62,11 +62,6 @@ def test_an_empty_scan_is_a_scan(ranges: list[float]) -> None:
         ({"ranges": [1.0], "angle_increment": 0.1}, "bearings: expected either bearings or both"),
         ({"ranges": [1.0], "bearings": [0.0], "angle_min": 0.0, "angle_increment": 0.1}, "bearings: expected either"),
         ({"ranges": [1.0, 1.0], "bearings": [0.0, np.nan]}, "bearings: expected finite numbers, got 1 that are not"),
-        (
-            {"ranges": [1.0, 1.0, 1.0], "bearings": [0.0, 0.2, 0.1]},
-            "bearings: expected counter-clockwise .* got a step back after beam 1",
-        ),
-        ({"ranges": [1.0, 1.0], "angle_min": 0.0, "angle_increment": -0.1}, "bearings: expected counter-clockwise"),
     ],
 )
 def test_wrong_arguments_are_named(arguments: dict, message: str) -> None:
@@ -140,6 +135,6 @@ def test_limits_that_leave_nothing_between_them_are_refused() -> None:
 
 
 def test_beams_that_all_go_one_way_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"^angle_increment: expected more than 0, got 0$"):
+    with pytest.raises(ValueError, match=r"^angle_increment: expected radians from beam to beam, got 0$"):
         Scan.from_ranges([1.0, 2.0], angle_min=0.0, angle_increment=0.0)
     assert len(Scan.from_ranges([1.0], angle_min=0.0, angle_increment=0.0)) == 1

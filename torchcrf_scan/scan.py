@@ -5,56 +5,36 @@ second the `target`; a motion `T_target_source` = (theta, tx, ty) maps source po
 
 There are two numberings. A *beam* is an entry of the input arrays, valid or not; a *point* is a valid return.
 Annotations and `PairPrediction` count beams (as files do), tensors count points; `Scan.beam` maps points to beams.
+Beams come in any order and direction, points are kept counter-clockwise.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from torchcrf_scan.beams import FARTHEST, Bools, Floats, Ints, bearings_of, check_sensor, times_of, vector
 
 BACKGROUND = 0
 OUTLIER = -1
 MAX_RANGE_MARGIN = 0.05  # spec 0.2: a range this close to range_max is a beam without return
-FARTHEST = 1e6  # metres; larger ranges are treated as invalid, as their squares would lose single precision
 CLOSED_SPAN = float(np.radians(315.0))  # a scan that spans at least this much has neighbours across +-180 deg (A-06)
-
-
-def _vector(name: str, values: ArrayLike, length: int | None = None) -> Floats:
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim != 1 or (length is not None and len(array) != length):
-        expected = "(N,)" if length is None else f"({length},)"
-        raise ValueError(f"{name}: expected shape {expected}, got {array.shape}")
-    return array
-
-
-def check_sensor(range_min: float | None, range_max: float | None, range_noise: float | None) -> None:
-    """Raises ValueError for impossible sensor limits: not a number, an empty interval, or noise out of bounds."""
-    least = 0.0 if range_min is None else range_min
-    if not np.isfinite(least):
-        raise ValueError(f"range_min: expected a finite number of metres, got {range_min}")
-    if range_max is not None and not range_max > max(least, 0.0):
-        raise ValueError(f"range_max: expected more than range_min = {max(least, 0.0)}, got {range_max}")
-    if range_noise is not None and not 0 <= range_noise <= FARTHEST:
-        raise ValueError(f"range_noise: expected metres between 0 and {FARTHEST:g}, got {range_noise}")
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """The valid returns of one planar laser scan, in beam order.
+    """The valid returns of one planar laser scan, counter-clockwise.
 
     Attributes:
         ranges: (N,) metres.
         bearings: (N,) radians, counter-clockwise, non-decreasing.
-        beam: (N,) index of every return in the input arrays.
+        beam: (N,) index of every return in the input arrays, which may have any order.
         n_beams: length of those arrays.
         range_min, range_max, range_noise: metres, None when unknown.
+        times: (N,) seconds of every return after the first beam of the input; None: unknown.
     """
 
     ranges: Floats
@@ -64,6 +44,7 @@ class Scan:
     range_min: float | None = None
     range_max: float | None = None
     range_noise: float | None = None
+    times: Floats | None = None
 
     @classmethod
     def from_ranges(
@@ -76,37 +57,37 @@ class Scan:
         range_min: float | None = None,
         range_max: float | None = None,
         range_noise: float | None = None,
+        time_increment: float | None = None,
+        times: ArrayLike | None = None,
     ) -> Scan:
-        """A scan from ranges and bearings, or from ranges, `angle_min` and `angle_increment`.
+        """A scan from ranges and bearings, or from ranges, `angle_min` and `angle_increment` (negative: clockwise).
 
-        Invalid returns (not finite, not above max(range_min, 0), not below range_max - 0.05 m or `FARTHEST`) are dropped. An
-        infinite range_max is no limit.
+        Beams may be in any order. Invalid returns (not finite, masked, not above max(range_min, 0), not below range_max - 0.05 m
+        or `FARTHEST`) are dropped: REP 117, and what sensor_msgs/LaserScan says of its limits. An infinite range_max is no limit.
+
+        Args:
+            ranges: (N,) metres. bearings: (N,) radians, counter-clockwise positive.
+            angle_min, angle_increment: radians, of the first beam and from each to the next.
+            range_min, range_max, range_noise: metres, of the sensor.
+            time_increment: seconds from each beam of the input to the next; 0: unknown, as drivers leave it.
+            times: (N,) seconds of every beam, instead; those after the first beam are kept.
 
         Raises:
-            ValueError: wrong shapes, neither or both forms of bearings, bearings not finite or decreasing, impossible limits.
+            ValueError: wrong shapes, neither or both forms of bearings or of times, bearings that are not finite or span more
+                than a turn, impossible limits.
         """
-        ranges = _vector("ranges", ranges)
+        ranges = vector("ranges", ranges)
         check_sensor(range_min, range_max, range_noise)
-        steps = [value for value in (angle_min, angle_increment) if value is not None]
-        if len(steps) != (2 if bearings is None else 0):
-            raise ValueError("bearings: expected either bearings or both angle_min and angle_increment, got neither, half or both")
-        if bearings is None:
-            first, increment = steps
-            if increment == 0 and len(ranges) > 1:
-                raise ValueError("angle_increment: expected more than 0, got 0")
-            bearings = first + increment * np.arange(len(ranges))
-        bearings = _vector("bearings", bearings, len(ranges))
-        if not np.isfinite(bearings).all():
-            raise ValueError(f"bearings: expected finite numbers, got {np.count_nonzero(~np.isfinite(bearings))} that are not")
-        back = np.flatnonzero(np.diff(bearings) < 0)
-        if len(back):
-            raise ValueError(f"bearings: expected counter-clockwise (non-decreasing), got a step back after beam {back[0]}")
+        bearings = bearings_of(len(ranges), bearings, angle_min, angle_increment)
+        after = times_of(len(ranges), time_increment, times)
         with np.errstate(invalid="ignore"):
             valid = (ranges < FARTHEST) & (ranges > max(range_min or 0.0, 0.0))
             if range_max is not None:
                 valid &= ranges < range_max - MAX_RANGE_MARGIN
         beam = np.flatnonzero(valid)
-        return cls(ranges[beam], bearings[beam], beam, len(ranges), range_min, range_max, range_noise)
+        beam = beam[np.argsort(bearings[beam], kind="stable")]
+        after = after if after is None else after[beam]
+        return cls(ranges[beam], bearings[beam], beam, len(ranges), range_min, range_max, range_noise, after)
 
     def __len__(self) -> int:
         return len(self.ranges)
@@ -127,6 +108,29 @@ class Scan:
         out = np.full((self.n_beams, *values.shape[1:]), fill, dtype=values.dtype)
         out[self.beam] = values
         return out
+
+    def only(self, keep: Bools) -> Scan:
+        """The scan of some of its returns, the same beams. keep: (N,)."""
+        times = None if self.times is None else self.times[keep]
+        return replace(self, ranges=self.ranges[keep], bearings=self.bearings[keep], beam=self.beam[keep], times=times)
+
+    @property
+    def beam_bearings(self) -> Floats:
+        """(n_beams,) bearings of all beams, those without return interpolated between their neighbours (held at the ends)."""
+        if len(self) == 0:
+            return np.zeros(self.n_beams)
+        order = np.argsort(self.beam)
+        return np.interp(np.arange(self.n_beams), self.beam[order], self.bearings[order])
+
+    @property
+    def rank(self) -> Ints:
+        """(n_beams,) place of every beam among all of them, counter-clockwise: neighbours differ by 1."""
+        steps, number = np.diff(self.beam), np.arange(self.n_beams)
+        if (steps >= 0).all():
+            return number
+        if (steps <= 0).all():
+            return number[::-1]
+        return np.argsort(np.argsort(self.beam_bearings, kind="stable"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +154,7 @@ class Annotation:
 
 @dataclass(frozen=True, slots=True)
 class ScanPair:
-    """Two consecutive scans `dt` seconds apart, with or without annotation.
+    """Two consecutive scans `dt` > 0 seconds apart, with or without annotation.
 
     `sequence` names the recording (pairs of one sequence overlap in time: never split one between training and test), `name`
     the pair, `origin` where the data comes from. `initial_motion` (3,) is a guess of the background's `T_target_source`, from
@@ -165,6 +169,10 @@ class ScanPair:
     name: str = ""
     origin: str = ""
     initial_motion: Floats | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.dt < np.inf:
+            raise ValueError(f"dt: expected a finite number of seconds above 0, got {self.dt}")
 
 
 @dataclass(frozen=True, slots=True)

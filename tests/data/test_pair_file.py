@@ -5,9 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data import pair_file
 from torchcrf_scan.data.pair_file import read_pair, read_prediction, write_pair, write_prediction
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
@@ -74,7 +76,7 @@ def scans(draw: st.DrawFn) -> Scan:
     n = draw(st.integers(0, 12))
     valid = st.floats(0.2, 29.0)
     ranges = draw(st.lists(st.one_of(valid, valid, st.sampled_from(NO_RETURNS)), min_size=n, max_size=n))
-    bearings = sorted(draw(st.lists(st.floats(-3.1, 3.1), min_size=n, max_size=n)))
+    bearings = draw(st.lists(st.floats(-3.1, 3.1), min_size=n, max_size=n))
     return Scan.from_ranges(ranges, bearings, range_min=0.1, range_max=30.0, range_noise=None)
 
 
@@ -191,7 +193,7 @@ WRONG: list[tuple[str, Any, str]] = [
     ("source_ranges", np.ones(6, complex), "dtype float, got complex128"),
     ("source_bearings", np.ones(5), r"shape \(6\), got \(5,\)"),
     ("source_bearings", np.array([0, 1, 2, np.nan, 3, 4]), "finite bearings, got nan at index 3"),
-    ("target_bearings", np.array([0.0, 1.0, 0.5, 2.0, 3.0]), "non-decreasing.* got 0.5 at index 2"),
+    ("target_bearings", np.arange(-2.0, 3.0) * 90, r"radians of one turn, got a span of 360.0; are these degrees\?"),
     ("dt", np.float64(0.0), "a finite number above 0.0, got 0.0"),
     ("dt", np.float64(np.inf), "got inf"),
     ("dt", np.ones(1), r"shape \(\), got \(1,\)"),
@@ -290,7 +292,9 @@ def test_missing_file_is_an_os_error(tmp_path: Path) -> None:
 
 def test_refused_pair_leaves_nothing_behind(tmp_path: Path) -> None:
     pair = read_pair(save(tmp_path, pair_arrays()))
-    for wrong in ({"dt": -1.0}, {"target": dataclasses.replace(pair.target, range_max=20.0)}):
+    assert pair.annotation is not None
+    short = dataclasses.replace(pair.annotation, cluster=np.zeros(2, int))
+    for wrong in ({"annotation": short}, {"target": dataclasses.replace(pair.target, range_max=20.0)}):
         with pytest.raises(ValueError, match=r"new\.npz"):
             write_pair(tmp_path / "new.npz", dataclasses.replace(pair, **wrong))
     assert [file.name for file in tmp_path.iterdir()] == ["pair.npz"]
@@ -309,6 +313,30 @@ def test_interrupted_writing_leaves_the_old_file(tmp_path: Path, monkeypatch: py
         write_pair(path, pair)
     assert path.read_bytes() == before
     assert [file.name for file in tmp_path.iterdir()] == ["pair.npz"]
+
+
+def test_beams_in_any_order(tmp_path: Path) -> None:
+    """The annotation counts the beams of the file, as predictions do."""
+    arrays = pair_arrays()
+    right = read_pair(save(tmp_path, arrays))
+    for side, order in (("source", np.array([3, 0, 5, 1, 4, 2])), ("target", np.arange(5)[::-1])):
+        arrays |= {f"{side}_{key}": arrays[f"{side}_{key}"][order] for key in ("ranges", "bearings")}
+    there = np.append(np.arange(5)[::-1], -1)  # where a target beam is now
+    order = np.array([3, 0, 5, 1, 4, 2])
+    arrays |= {key: arrays[key][order] for key in ("association", "cluster", "body", "ignore")}
+    arrays["association"] = there[arrays["association"]]
+    pair = read_pair(save(tmp_path, arrays))
+    for side in ("source", "target"):
+        np.testing.assert_array_equal(getattr(pair, side).points, getattr(right, side).points)
+    assert pair.annotation is not None
+    assert right.annotation is not None
+    np.testing.assert_array_equal(pair.annotation.cluster[pair.source.beam], right.annotation.cluster)
+    batches = [ScanPairBatch.collate([one]).truth for one in (pair, right)]
+    assert torch.equal(batches[0].association, batches[1].association)
+    write_pair(tmp_path / "again.npz", pair)
+    with np.load(tmp_path / "again.npz") as file:
+        for key in ("source_ranges", "source_bearings", "target_bearings", "association", "cluster"):
+            np.testing.assert_array_equal(file[key], arrays[key])
 
 
 def test_bearings_of_dropped_beams_are_interpolated(tmp_path: Path) -> None:

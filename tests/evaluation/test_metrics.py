@@ -9,7 +9,7 @@ from made_pairs import make_pair, make_prediction, make_small, perfect, perturbe
 
 from torchcrf_scan.evaluation.counterparts import match_movers, relabel
 from torchcrf_scan.evaluation.metrics import edit_distance, score_pair
-from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.scan import Scan, ScanPair
 
 
 @pytest.fixture
@@ -103,3 +103,23 @@ def test_errors_name_what_is_wrong(small: ScanPair) -> None:
     beyond = dataclasses.replace(perfect(small), association=np.full(12, 12))
     with pytest.raises(ValueError, match="association below 12, got 12"):
         score_pair(small, beyond)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_scores_do_not_depend_on_the_numbering_of_the_beams(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pair = make_pair(40, 50, 2, rng, drop=0.2)
+    answer = perturbed(pair, rng)
+    truth, ways = truth_of(pair), (np.arange(40)[::-1], np.arange(50)[::-1])
+    there = np.append(ways[1], -1)
+    scans = [renumbered(scan, order) for scan, order in zip((pair.source, pair.target), ways, strict=True)]
+    labels = {key: getattr(truth, key)[ways[0]] for key in ("cluster", "body", "ignore")}
+    annotation = dataclasses.replace(truth, association=there[truth.association][ways[0]], **labels)
+    answer_there = dataclasses.replace(answer, association=there[answer.association][ways[0]], cluster=answer.cluster[ways[0]])
+    turned = dataclasses.replace(pair, source=scans[0], target=scans[1], annotation=annotation)
+    assert score_pair(turned, answer_there) == score_pair(pair, answer)
+    assert score_pair(pair, answer).within_2 > score_pair(pair, answer).within_1
+
+
+def renumbered(scan: Scan, order: np.ndarray) -> Scan:
+    return Scan.from_ranges(scan.to_beams(scan.ranges, np.nan)[order], scan.beam_bearings[order])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from figures import axes_titled, make_pair, make_prediction, render, words
+from figures import axes_titled, make_pair, make_prediction, words
 from matplotlib.quiver import Quiver
 
 from torchcrf_scan.geometry import se2
@@ -57,14 +57,6 @@ def test_zoom_holds_the_largest_mover():
     x, y = pair.source.points[cluster == 2].T
     assert ax.get_xlim()[0] < x.min() < x.max() < ax.get_xlim()[1]
     assert ax.get_ylim()[0] < y.min() < y.max() < ax.get_ylim()[1]
-
-
-@pytest.mark.parametrize("dt", [0.0, np.nan])
-def test_unknown_time_has_no_speeds(dt, tmp_path):
-    pair = replace(make_pair(), dt=dt)
-    figure = plots.plot_clusters(pair, {})
-    assert "m/s" not in words(axes_titled(figure, "truth"))
-    render(figure, tmp_path)
 
 
 def test_arrows_of_all_methods_stand_for_the_same_time():

@@ -3,7 +3,8 @@
 A pair file holds `source_ranges`, `source_bearings` (N,), `target_ranges`, `target_bearings` (M,), `dt` and, optionally, the
 annotation (`association`, `cluster`, `body`, `ignore` (N,), `motions` (K+1, 3)), the sensor (`range_min`, `range_max`,
 `range_noise`) and the texts `sequence` and `source` (`ScanPair.origin`). A prediction file holds the fields of `PairPrediction`.
-Both count beams: an index is an entry of the file's arrays, including invalid returns. Unknown keys are ignored.
+Both count beams: an index is an entry of the file's arrays, in their order, whatever it is, including invalid returns. Unknown
+keys are ignored.
 
 Writing is atomic and checked by the reader's own rules; the same content gives the same bytes.
 """
@@ -20,7 +21,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcrf_scan.scan import OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, Scan, ScanPair
+from torchcrf_scan.scan import OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, Scan, ScanPair, check_sensor
 
 _KINDS: dict[str, tuple[str, type]] = {
     "float": ("fiu", np.float64),
@@ -114,7 +115,7 @@ def write_pair(path: str | Path, pair: ScanPair) -> None:
     """Writes a pair file: all beams, with NaN ranges for beams without return.
 
     `Scan` does not keep the bearings of such beams: they are interpolated between their neighbours (held at the ends). The
-    pair's name is not written, it is the file's.
+    pair's name is not written, it is the file's; nor are times of beams and an initial motion.
 
     Raises:
         ValueError: a pair that `read_pair` would reject, or scans of different sensors. No file is written.
@@ -157,9 +158,10 @@ def _parse_pair(fields: _Fields) -> ScanPair:
 
 def _parse_sensor(fields: _Fields) -> dict[str, float | None]:
     sensor = {key: fields.number(key, at_least=0.0) if key in fields else None for key in _SENSOR_KEYS}
-    low, high = sensor["range_min"] or 0.0, sensor["range_max"]
-    if high is not None and high <= low:
-        fields.fail("range_max", f"more than range_min = {low}", high)
+    try:
+        check_sensor(**sensor)
+    except ValueError as error:
+        raise ValueError(f"{fields.path}: {error}") from error
     return sensor
 
 
@@ -168,12 +170,10 @@ def _parse_scan(fields: _Fields, side: str, sensor: dict[str, float | None]) -> 
     key = f"{side}_bearings"
     bearings = fields.get(key, "float", len(ranges))
     fields.require(key, bearings, np.isfinite(bearings), "finite bearings")
-    is_sorted = np.diff(bearings, prepend=bearings[:1]) >= 0
-    fields.require(key, bearings, is_sorted, "counter-clockwise (non-decreasing) bearings")
     try:
         return Scan.from_ranges(ranges, bearings, **sensor)
     except ValueError as error:
-        raise ValueError(f"{fields.path}: {error}") from error
+        raise ValueError(f"{fields.path}: {side}_{error}") from error
 
 
 def _parse_annotation(fields: _Fields, source: Scan, target: Scan) -> Annotation | None:
@@ -235,7 +235,7 @@ def _pair_arrays(path: Path, pair: ScanPair) -> dict[str, NDArray[Any]]:
     arrays: dict[str, Any] = {}
     for side, scan in (("source", pair.source), ("target", pair.target)):
         arrays[f"{side}_ranges"] = scan.to_beams(np.asarray(scan.ranges, np.float64), np.nan)
-        arrays[f"{side}_bearings"] = _all_bearings(scan)
+        arrays[f"{side}_bearings"] = scan.beam_bearings
     arrays["dt"] = np.float64(pair.dt)
     if pair.annotation is not None:
         arrays |= _annotation_arrays(pair.annotation, _is_return(pair.source))
@@ -254,13 +254,6 @@ def _annotation_arrays(annotation: Annotation, is_return: Bools) -> dict[str, ND
     if arrays["ignore"].shape == is_return.shape:  # otherwise the reader's check raises
         arrays["ignore"] = arrays["ignore"] | ~is_return
     return arrays
-
-
-def _all_bearings(scan: Scan) -> Floats:
-    """(n_beams,) bearings, interpolated for dropped beams."""
-    if len(scan) == 0:
-        return np.zeros(scan.n_beams)
-    return np.interp(np.arange(scan.n_beams), scan.beam, scan.bearings)
 
 
 def _load(path: Path, keys: Sequence[str]) -> _Fields:

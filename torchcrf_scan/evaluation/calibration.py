@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from torchcrf_scan.evaluation.counterparts import match_movers, relabel
+from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers, relabel
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, Bools, Floats, PairPrediction, ScanPair
 
@@ -140,11 +140,10 @@ def rightness(pair: ScanPair, prediction: PairPrediction, tolerance: int = 2) ->
     beam = pair.source.beam
     known = ~pair.annotation.ignore[beam]
     truth, answer = pair.annotation.association[beam], prediction.association[beam]
-    is_same_kind = (truth < 0) == (answer < 0)
-    off = np.where(truth < 0, 0, np.abs(truth - answer))
+    off = beams_apart(pair.target, truth, answer)
     cluster, found = pair.annotation.cluster[beam], prediction.cluster[beam]
     numbered = relabel(found, cluster, match_movers(cluster[known], found[known]))
-    return Rightness(known, is_same_kind & (off == 0), is_same_kind & (off <= tolerance), numbered == cluster)
+    return Rightness(known, off == 0, off <= tolerance, numbered == cluster)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,11 +1,11 @@
-"""Matching of the movers of two labellings by overlap."""
+"""Comparison of two labellings: movers matched by overlap, associations by the beams between them."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from torchcrf_scan.scan import BACKGROUND, Ints
+from torchcrf_scan.scan import BACKGROUND, Floats, Ints, Scan
 
 
 def match_movers(cluster: Ints, predicted: Ints) -> dict[int, int]:
@@ -46,3 +46,11 @@ def movers_in_order(labels: Ints) -> Ints:
     ids, first = np.unique(labels, return_index=True)
     ids = ids[np.argsort(first)]
     return ids[ids > BACKGROUND]
+
+
+def beams_apart(target: Scan, association: Ints, other: Ints) -> Floats:
+    """(N,) target beams between two associations (N,): 0 where both are outliers, inf where only one is."""
+    is_outlier, is_other = association < 0, other < 0
+    rank = np.append(target.rank, 0)  # the last entry is for -1
+    apart = np.where(is_outlier != is_other, np.inf, np.abs(rank[association] - rank[other]))
+    return np.where(is_outlier & is_other, 0.0, apart)

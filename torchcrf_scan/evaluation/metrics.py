@@ -12,7 +12,7 @@ import numpy as np
 from rapidfuzz.distance import Levenshtein
 
 from torchcrf_scan.evaluation.calibration import Sureness
-from torchcrf_scan.evaluation.counterparts import match_movers, relabel
+from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers, relabel
 from torchcrf_scan.evaluation.measures import EVERY, Count, Labelled
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
@@ -139,12 +139,12 @@ def score_pair(pair: ScanPair, prediction: PairPrediction) -> PairScore:
         ValueError: a pair without annotation, or a prediction with another number of beams or with invalid target beams.
     """
     truth = _checked_annotation(pair, prediction)
-    keep = pair.source.to_beams(np.ones(len(pair.source), dtype=bool), False) & ~truth.ignore
+    keep = pair.source.beam[~truth.ignore[pair.source.beam]]  # counter-clockwise, whatever the beams' order
     association, predicted_association = truth.association[keep], prediction.association[keep]
     cluster, predicted_cluster = truth.cluster[keep], prediction.cluster[keep]
     points = pair.source.to_beams(pair.source.points, np.nan)[keep]
 
-    offset = _index_offset(association, predicted_association)
+    offset = beams_apart(pair.target, association, predicted_association)
     labels = Labelled(pair, association, cluster, truth.body[keep], predicted_association, predicted_cluster)
     matched = match_movers(cluster, predicted_cluster)
     moving = _moving(truth.body[keep], predicted_cluster)
@@ -182,13 +182,6 @@ def _checked_annotation(pair: ScanPair, prediction: PairPrediction) -> Annotatio
     if n and int(prediction.association.max()) >= m:
         raise ValueError(f"prediction of pair {pair.name!r}: expected association below {m}, got {prediction.association.max()}")
     return pair.annotation
-
-
-def _index_offset(association: Ints, predicted: Ints) -> Floats:
-    """(N,) distance of the target indices, 0 where both are outliers, inf where only one is."""
-    is_outlier, is_predicted = association < 0, predicted < 0
-    offset = np.where(is_outlier != is_predicted, np.inf, np.abs(association - predicted))
-    return np.where(is_outlier & is_predicted, 0.0, offset)
 
 
 def _label_score(labels: Ints, predicted: Ints) -> LabelScore:

@@ -45,7 +45,8 @@ def mirror(pair: ScanPair) -> ScanPair:
 def _mirror_scan(scan: Scan) -> Scan:
     """The mirrored scan: bearings change their sign, and reversing the beams makes them ascend again."""
     beam = scan.n_beams - 1 - scan.beam[::-1]
-    return replace(scan, ranges=scan.ranges[::-1].copy(), bearings=-scan.bearings[::-1], beam=beam)
+    times = None if scan.times is None else scan.times[::-1].copy()
+    return replace(scan, ranges=scan.ranges[::-1].copy(), bearings=-scan.bearings[::-1], beam=beam, times=times)
 
 
 def _mirror_annotation(truth: Annotation, target_beams: int) -> Annotation:
@@ -80,7 +81,7 @@ def _drop(scan: Scan, share: float, generator: torch.Generator) -> tuple[Scan, B
     """The scan without the dropped returns, and (n_beams,) whether a beam's return was dropped."""
     keep = (torch.rand(len(scan), generator=generator, dtype=torch.float64) >= share).numpy()
     lost = scan.to_beams(~keep, False)
-    return replace(scan, ranges=scan.ranges[keep], bearings=scan.bearings[keep], beam=scan.beam[keep]), lost
+    return scan.only(keep), lost
 
 
 def _without(truth: Annotation, source_lost: Bools, target_lost: Bools) -> Annotation:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchcrf_scan.evaluation.counterparts import match_movers
+from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers
 from torchcrf_scan.scan import BACKGROUND, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 
 ASSOCIATION_TOLERANCE = 2  # beams; associations within this distance are drawn as right
@@ -81,8 +81,7 @@ def judge(name: str, drawn: Labels, pair: ScanPair, guess: Labels, truth: Labels
     assert pair.annotation is not None
     known = ~pair.annotation.ignore
     known &= pair.source.to_beams(np.ones(len(pair.source), dtype=bool), False)
-    a, b = guess.association, truth.association
-    near = ((a < 0) & (b < 0)) | ((a >= 0) & (b >= 0) & (np.abs(a - b) <= ASSOCIATION_TOLERANCE))
+    near = beams_apart(pair.target, guess.association, truth.association) <= ASSOCIATION_TOLERANCE
     return Answer(name, drawn, known & ~near, known & (guess.cluster != truth.cluster))
 
 

@@ -43,8 +43,6 @@ def make_scene(pair: ScanPair, answers: list[Labels]) -> Scene:
 
 def mover_velocities(source: Floats, dt: float, labels: Labels) -> dict[int, tuple[Floats, Floats]]:
     """Mover -> its centroid and its velocity relative to the world in the source frame, (2,) each, if both are known."""
-    if not (np.isfinite(dt) and dt > 0.0):
-        return {}
     background = labels.motion(BACKGROUND)
     centroids = {k: _centroid(source, labels.cluster == k) for k in labels.movers.tolist()}
     found = {k: (centroid, ground_velocity(centroid, labels.motion(k), background, dt)) for k, centroid in centroids.items()}
