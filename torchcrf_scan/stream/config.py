@@ -22,6 +22,8 @@ class StreamConfig:
         gap: seconds without a placed scan after which the stream starts anew from the predicted pose.
         memory: number of earlier scans asked what they saw where a point lies now,
         memory_spacing: and seconds between them.
+        least_way: metres that a track goes before it counts as a moving object,
+        least_speed: or metres per second that it is fast.
         deskew: scans with beam times are corrected for the motion during their sweep.
     """
 
@@ -34,6 +36,8 @@ class StreamConfig:
     gap: Annotated[float, Within(0, above=True)] = 2.0
     memory: Annotated[int, Within(0, 1000)] = 6
     memory_spacing: Amount = 0.5
+    least_way: Amount = 0.3
+    least_speed: Amount = 0.5
     deskew: bool = True
 
     def __post_init__(self) -> None:

@@ -32,13 +32,20 @@ def deskewed(scan: Scan, velocity: Floats, at: float = 0.0) -> Scan:
     return replace(scan, ranges=ranges, bearings=bearings[order], beam=scan.beam[order], times=scan.times[order])
 
 
-def doubt(scan: Scan, period: float) -> str:
-    """Why the times of a scan's beams are not believed, in words; empty: they are. period: seconds between scans."""
+def doubt(scan: Scan, period: float | None) -> str:
+    """Why the times of a scan's beams are not believed, in words; empty: they are.
+
+    period: seconds between scans; None: not known yet.
+    """
     if scan.times is None or len(scan) < 2:
         return "no times"
     sweep, span = float(np.ptp(scan.times)), float(np.ptp(scan.bearings))
-    if not 0 < sweep <= LONGEST * period:
-        return f"a sweep of {sweep:.3g} s, longer than the {period:.3g} s between scans" if sweep > 0 else "no times"
+    if sweep <= 0:
+        return "no times"
+    if period is None:
+        return ""
+    if sweep > LONGEST * period:
+        return f"a sweep of {sweep:.3g} s, longer than the {period:.3g} s between scans"
     expected = span / (2 * np.pi) * period
     if sweep < SHORTEST * expected:
         return (
@@ -58,20 +65,20 @@ class Deskewing:
         self.is_on = is_on
         self._has_warned = False
 
-    def middle(self, scan: Scan, period: float) -> float:
+    def middle(self, scan: Scan, period: float | None) -> float:
         """Seconds from the first beam to the mean time of the returns: a pose then found hardly depends on the velocity that the
         scan was corrected by, and errors of velocities do not grow from scan to scan. 0 for a scan that is not corrected.
 
-        period: seconds between scans.
+        period: seconds between scans; None: not known yet.
         """
         return float(np.mean(scan.times)) if scan.times is not None and self.suits(scan, period) else 0.0
 
-    def suits(self, scan: Scan, period: float) -> bool:
-        """Whether the scan has plausible times. period: seconds between scans."""
+    def suits(self, scan: Scan, period: float | None) -> bool:
+        """Whether the scan has plausible times. period: as in `doubt`."""
         if not self.is_on or scan.times is None:
             return False
         why = doubt(scan, period)
         if why and why != "no times" and not self._has_warned:
             self._has_warned = True
-            log.warning("beam times give %s between scans %.3g s apart: scans are not corrected for the sweep", why, period)
+            log.warning("the times of the beams give %s: scans are not corrected for the sweep", why)
         return not why

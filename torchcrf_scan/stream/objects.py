@@ -10,11 +10,14 @@ import numpy as np
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.result import MovingObject
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, Ints, PairPrediction, Scan
+from torchcrf_scan.search.expected import Expected
+from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.stream.config import StreamConfig
 from torchcrf_scan.stream.memory import Memory, Votes
 from torchcrf_scan.stream.tracks import Tracker, TrackPrediction
 from torchcrf_scan.stream.view import View
 
+LOG_MOVED, LOG_STOOD = 2.0, 2.0  # log potentials for moving of a point that has moved, against it of one that has stood
 STOOD = 0.5  # share of a cluster's points that have stood, above which it does not move
 NEAR = 0.1  # metres from where a point of an object was expected, beside the track's own uncertainty,
 FARTHEST = 0.5  # at most
@@ -36,7 +39,7 @@ class Clusters:
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """What moves in a scan. is_moving: (P,) bool. track: (P,) 0 background, an object's number, -1 unknown."""
+    """What moves in a scan. is_moving: (P,) bool. track: (P,) 0 background, the number of one of the objects, -1 unknown."""
 
     is_moving: Bools
     track: Ints
@@ -53,6 +56,25 @@ class Objects:
     def __init__(self, config: StreamConfig) -> None:
         self.tracker = Tracker()
         self.memory = Memory(config.memory_spacing, config.memory)
+        self._config = config
+        self._births: dict[int, Floats] = {}  # where confirmed tracks were first seen, by number
+        self._movers: set[int] = set()  # those that have moved since
+
+    def expect(self, grid: ScanGrid, pose: Floats, reference: View, time: float) -> Expected:
+        """What is known of the movers of a scan before it is matched to an earlier one: hypotheses, never trusted blindly.
+
+        Args:
+            grid: of the scan. pose: (3,) where it was probably taken, at a time in seconds.
+        """
+        points, votes = se2.apply(pose, grid.scan.points), self.memory.look(grid, pose)
+        log_moving = LOG_MOVED * votes.has_moved - LOG_STOOD * votes.has_stood
+        motions, members = [], []
+        for track in self.tracker.predict(time):
+            back = np.array([0.0, *(-track.velocity * (time - reference.time))])
+            motions.append(se2.compose(se2.inverse(reference.pose), se2.compose(back, pose)))
+            members.append(_near(points, track))
+        count = len(motions)
+        return Expected(np.reshape(motions, (count, 3)), np.reshape(members, (count, len(points))).astype(np.bool_), log_moving)
 
     def update(self, view: View, cluster: Ints, found: PairPrediction, reference: View) -> Moving:
         """Takes a placed scan.
@@ -68,8 +90,19 @@ class Objects:
         self.memory.add(view)
         sensor = view.pose[1:]
         numbers, objects = self.tracker.update(view.time, points, seen.label, seen.velocity, seen.covariance, sensor)
-        track = np.concatenate([[BACKGROUND], numbers, [OUTLIER]])[seen.label]  # label -1 is the last
-        return Moving(track > BACKGROUND, track, objects)
+        movers = self._that_moved(objects)
+        known = np.where(np.isin(numbers, [of.number for of in movers]), numbers, OUTLIER)
+        track = np.concatenate([[BACKGROUND], known, [OUTLIER]])[seen.label]  # label -1 is the last
+        return Moving(track > BACKGROUND, track, movers)
+
+    def _that_moved(self, objects: Sequence[MovingObject]) -> tuple[MovingObject, ...]:
+        """Confirmed tracks that went some way or are fast, now or earlier: the edge of a shadow may be followed too."""
+        self._births = {of.number: self._births.get(of.number, of.position) for of in objects}
+        way, speed = self._config.least_way, self._config.least_speed
+        gone = {of.number for of in objects if np.hypot(*(of.position - self._births[of.number])) > way}
+        fast = {of.number for of in objects if np.hypot(*of.velocity) > speed}
+        self._movers = (self._movers & self._births.keys()) | gone | fast
+        return tuple(of for of in objects if of.number in self._movers)
 
     def begin(self, view: View) -> None:
         """Begins with a scan, the first or that after a gap: what earlier ones saw is forgotten; objects end by themselves."""

@@ -16,8 +16,9 @@ from torchcrf_scan.stream.clock import Clock
 from torchcrf_scan.stream.config import StreamConfig
 from torchcrf_scan.stream.covariance import LEAST, unknown, velocity_covariance, world_covariance
 from torchcrf_scan.stream.deskew import Deskewing, deskewed
+from torchcrf_scan.stream.fusion import fused
 from torchcrf_scan.stream.objects import Moving, Objects, nothing_moves
-from torchcrf_scan.stream.placement import Placement, explained_by, following, grid_at, place
+from torchcrf_scan.stream.placement import Placement, explained_by, grid_at, place
 from torchcrf_scan.stream.sanity import LEAST_OF_BEST, Backed, choose_background
 from torchcrf_scan.stream.view import History, View
 
@@ -31,12 +32,18 @@ ASTRAY = (
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """A scan placed in the world: its pose and covariance there, and the placement, on the keyframe or on the scan before."""
+    """A scan placed in the world.
+
+    Attributes:
+        covariance: (3, 3) of its pose. placement: on the keyframe or, if not `on_keyframe`, on the scan that it was matched to.
+        is_torn: the two disagree.
+    """
 
     view: View
     covariance: Floats
     placement: Placement
     on_keyframe: bool
+    is_torn: bool
 
 
 class ScanStream:
@@ -62,6 +69,7 @@ class ScanStream:
         self._keyframe: View | None = None
         self._pose, self._twist = np.zeros(3), np.zeros(3)
         self._covariance = LEAST
+        self._has_velocity = self._is_led = False  # whether constant velocity, or odometry, predicts the next pose
         self._late = 0.0  # seconds from the last stamp to the time of the pose
         self._odometry: Floats | None = None
 
@@ -83,8 +91,9 @@ class ScanStream:
         seen = self._corrected(scan, predicted, interval)
         reference = self._history.before(self._now - self.config.lag)
         guess = se2.compose(se2.inverse(reference.pose), predicted)
-        found = self.model.match(seen, reference.scan, self._now - reference.time, initial_motion=guess.tolist())
-        backed = choose_background(found.motions[0], guess, grid_at(seen, seen.points), reference.grid)
+        grid = grid_at(seen, seen.points)
+        found = self._match(seen, grid, reference, predicted)
+        backed = choose_background(found.motions[0], guess, grid, reference.grid)
         if backed.share < self.config.least_share:
             return self._not_placed(scan, stamp, predicted, backed)
         labels = labels_of(found, backed, seen)
@@ -109,7 +118,7 @@ class ScanStream:
     def _advance(self, scan: Scan, stamp: float) -> float:
         """Seconds since the time of the last pose. That of a swept scan is the middle of its sweep."""
         interval, before = self._clock.advance(stamp), self._late
-        self._late = self._deskewing.middle(scan, self._clock.usual)
+        self._late = self._deskewing.middle(scan, self._clock.known)
         return max(interval + self._late - before, LEAST_OF_INTERVAL * interval)
 
     def _corrected(self, scan: Scan, pose: Floats, interval: float) -> Scan:
@@ -118,9 +127,10 @@ class ScanStream:
 
     def _predict(self, interval: float, odometry: Floats | None) -> Floats:
         """(3,) the pose `interval` seconds after the last one, by odometry or constant velocity; after a gap where it was."""
-        before, self._odometry = self._odometry, None
+        before, self._odometry, self._is_led = self._odometry, None, False
         if odometry is not None and np.isfinite(odometry).all():
             self._odometry = np.asarray(odometry, dtype=np.float64)
+            self._is_led = before is not None
             if before is not None:
                 return se2.compose(self._pose, se2.compose(se2.inverse(before), self._odometry))
         if interval > self.config.gap:
@@ -130,6 +140,17 @@ class ScanStream:
     def _velocity(self, pose: Floats, interval: float) -> Floats:
         """(3,) the velocity that leads from the last pose to this one."""
         return twist.log(se2.compose(se2.inverse(self._pose), pose)) / interval
+
+    def _match(self, scan: Scan, grid: ScanGrid, reference: View, predicted: Floats) -> PairPrediction:
+        """The scan matched to an earlier one: a pair's answer labels its source, so that is the new scan."""
+        assert self._keyframe is not None
+        near = place(grid, self._keyframe.background, se2.compose(se2.inverse(self._keyframe.pose), predicted))
+        pose = se2.compose(self._keyframe.pose, near.motion)
+        if near.share < DOUBTED or np.abs(se2.compose(se2.inverse(predicted), pose)).max() > ASTRAY:
+            pose = predicted
+        expected = self._objects.expect(grid, pose, reference, self._now)
+        guess = se2.compose(se2.inverse(reference.pose), pose).tolist()
+        return self.model.match(scan, reference.scan, self._now - reference.time, initial_motion=guess, expected=expected)
 
     def _place(self, scan: Scan, labels: Ints, guess: Floats, reference: View, predicted: Floats) -> _Placed:
         """The scan's background on the keyframe, or on the scan before if that explains it much better.
@@ -146,18 +167,24 @@ class ScanStream:
             near = place(background, reference.background, se2.compose(se2.inverse(reference.pose), guess), self._factor)
             if is_astray or placement.share < DOUBTED * near.share:
                 placement, frame, on_keyframe = near, reference, False
-        pose = se2.compose(frame.pose, following(placement, se2.compose(se2.inverse(frame.pose), predicted)))
+        pose, covariance = se2.compose(frame.pose, placement.motion), world_covariance(placement.covariance, frame.pose)
+        if self._has_velocity or self._is_led:
+            pose = fused(predicted, pose, covariance, self._now - self._history.last.time)
         grid = grid_at(scan, scan.points)
-        if explains_less(pose, guess, grid, reference):  # what is not observed was predicted wrongly
-            pose, on_keyframe = guess, False
+        is_less = explains_less(pose, guess, grid, reference)  # what is not observed was predicted wrongly
+        pose, on_keyframe = (guess, False) if is_less else (pose, on_keyframe)
         view = View(scan, grid, background, pose, self._now)
-        return _Placed(view, world_covariance(placement.covariance, frame.pose), placement, on_keyframe)
+        return _Placed(view, covariance, placement, on_keyframe, is_less or is_astray)
 
     def _take(self, placed: _Placed, interval: float) -> Floats:
         """Remembers a placed scan; returns (3, 3) covariance of the velocity."""
         pose = placed.view.pose
         spread = velocity_covariance(placed.covariance, self._covariance, pose, interval)
         self._pose, self._twist, self._covariance = pose, self._velocity(pose, interval), placed.covariance
+        self._has_velocity = True
+        if placed.is_torn:  # scans that disagree about where the sensor was would be believed in turn
+            self._history.clear()
+            self._objects.begin(placed.view)
         self._history.add(placed.view, self.config.lag)
         if not (placed.on_keyframe and self._keeps_keyframe(placed.placement)):
             self._keyframe = placed.view
@@ -176,7 +203,7 @@ class ScanStream:
         self._history.clear()
         self._objects.begin(view)
         self._history.add(view, self.config.lag)
-        self._keyframe, self._pose, self._covariance = view, view.pose, LEAST
+        self._keyframe, self._pose, self._covariance, self._has_velocity = view, view.pose, LEAST, False
         return self._result(view.scan, stamp, nothing_moves(view.scan, BACKGROUND), unknown(), "ok", "")
 
     def _not_placed(self, scan: Scan, stamp: float, predicted: Floats, backed: Backed) -> ScanResult:
