@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.scan import Bools, Floats, Ints
+from torchcrf_scan.scan import Bools, Floats, Ints, Scan
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.leftover import OPEN, leftover_of
 from torchcrf_scan.search.surface import SEEN_THROUGH
@@ -29,6 +29,14 @@ class Votes(NamedTuple):
 
     through: Ints
     standing: Ints
+
+    def by_beam(self, scan: Scan) -> Votes:
+        """The votes on a scan's points, by beam (n_beams,)."""
+        return Votes(scan.to_beams(self.through, 0), scan.to_beams(self.standing, 0))
+
+    def of(self, index: Ints) -> Votes:
+        """The votes on some points or beams."""
+        return Votes(self.through[index], self.standing[index])
 
     @property
     def has_moved(self) -> Bools:

@@ -60,13 +60,13 @@ class Objects:
         self._births: dict[int, Floats] = {}  # where confirmed tracks were first seen, by number
         self._movers: set[int] = set()  # those that have moved since
 
-    def expect(self, grid: ScanGrid, pose: Floats, reference: View, time: float) -> Expected:
+    def expect(self, grid: ScanGrid, votes: Votes, pose: Floats, reference: View, time: float) -> Expected:
         """What is known of the movers of a scan before it is matched to an earlier one: hypotheses, never trusted blindly.
 
         Args:
-            grid: of the scan. pose: (3,) where it was probably taken, at a time in seconds.
+            grid: of the scan. votes: on its points. pose: (3,) where it was probably taken, at a time in seconds.
         """
-        points, votes = se2.apply(pose, grid.scan.points), self.memory.look(grid, pose)
+        points = se2.apply(pose, grid.scan.points)
         log_moving = LOG_MOVED * votes.has_moved - LOG_STOOD * votes.has_stood
         motions, members = [], []
         for track in self.tracker.predict(time):
@@ -76,14 +76,13 @@ class Objects:
         count = len(motions)
         return Expected(np.reshape(motions, (count, 3)), np.reshape(members, (count, len(points))).astype(np.bool_), log_moving)
 
-    def update(self, view: View, cluster: Ints, found: PairPrediction, reference: View) -> Moving:
+    def update(self, view: View, cluster: Ints, votes: Votes, found: PairPrediction, reference: View) -> Moving:
         """Takes a placed scan.
 
         Args:
-            cluster: (P,) labels of its points. found: the match with an earlier scan `reference`, of which they are.
+            cluster: (P,) labels of its points, of the match `found` with an earlier scan `reference`. votes: on its points.
         """
         points = se2.apply(view.pose, view.grid.scan.points)
-        votes = self.memory.look(view.grid, view.pose)
         seen = with_standing_removed(clusters_over_ground(view, cluster, found, reference), votes)
         seen = with_segments_filled(seen, votes, view.grid.scan.segment)
         seen = with_expected(seen, votes, points, self.tracker.predict(view.time))

@@ -17,6 +17,7 @@ from torchcrf_scan.search.grid import ScanGrid, grid_of
 from torchcrf_scan.search.leftover import leftover_of
 from torchcrf_scan.search.surface import surface_of
 
+TRUSTED = 0.8  # share of the points explained from which a refined motion is not doubted
 TIGHT = 1.0  # units of `leftover_of`: a return this near to a surface is explained by it
 
 
@@ -62,8 +63,8 @@ def place(grid: ScanGrid, other: ScanGrid, guess: Floats, factor: float = 1.0) -
     """
     motion = refine(guess[None], grid, other)[0]
     explained = explained_by(motion, grid, other)
-    if explained.sum() < explained_by(guess, grid, other).sum():  # it went astray
-        motion, explained = guess, explained_by(guess, grid, other)
+    if explained.mean() < TRUSTED and explained.sum() < (before := explained_by(guess, grid, other)).sum():  # it went astray
+        motion, explained = guess, before
     return placed(grid, other, motion, explained, factor)
 
 

@@ -17,6 +17,7 @@ from torchcrf_scan.stream.config import StreamConfig
 from torchcrf_scan.stream.covariance import LEAST, unknown, velocity_covariance, world_covariance
 from torchcrf_scan.stream.deskew import Deskewing, deskewed
 from torchcrf_scan.stream.fusion import fused
+from torchcrf_scan.stream.memory import Votes
 from torchcrf_scan.stream.objects import Moving, Objects, nothing_moves
 from torchcrf_scan.stream.placement import Placement, explained_by, grid_at, place
 from torchcrf_scan.stream.sanity import LEAST_OF_BEST, Backed, choose_background
@@ -25,9 +26,8 @@ from torchcrf_scan.stream.view import History, View
 FEWEST_POINTS = 3  # fewer returns do not determine a motion
 LEAST_OF_INTERVAL = 0.1  # that remain between the times of two poses when the middles of their sweeps differ
 DOUBTED = 0.5  # a keyframe that explains less than this share of what the scan before explains is not believed
-ASTRAY = (
-    0.5  # metres or radians between the placements on the keyframe and on the scan before, from which the former is not believed
-)
+ALIKE = 0.02  # metres or radians; poses this near explain the same
+ASTRAY = 0.5  # metres or radians between placements on both, from which the keyframe is not believed
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,19 +92,19 @@ class ScanStream:
         reference = self._history.before(self._now - self.config.lag)
         guess = se2.compose(se2.inverse(reference.pose), predicted)
         grid = grid_at(seen, seen.points)
-        found = self._match(seen, grid, reference, predicted)
+        found, votes = self._match(seen, grid, reference, predicted)
         backed = choose_background(found.motions[0], guess, grid, reference.grid)
         if backed.share < self.config.least_share:
             return self._not_placed(scan, stamp, predicted, backed)
         labels = labels_of(found, backed, seen)
-        placed = self._place(seen, labels, se2.compose(reference.pose, backed.motion), reference, predicted)
+        placed = self._place(seen, grid, labels, se2.compose(reference.pose, backed.motion), reference, predicted)
         again = self._corrected(scan, placed.view.pose, interval)  # by the motion found
         if again is not scan:
-            better = self._place(again, labels, placed.view.pose, reference, predicted)
+            better = self._place(again, grid_at(again, again.points), labels, placed.view.pose, reference, predicted)
             placed = max(better, placed, key=lambda of: of.placement.share)
         seen = placed.view.scan
         velocity = self._take(placed, interval)
-        moving = self._objects.update(placed.view, labels[seen.beam], found, reference)
+        moving = self._objects.update(placed.view, labels[seen.beam], votes.of(seen.beam), found, reference)
         reason = unobserved_in_words(placed.placement)
         return self._result(scan, stamp, moving.by_beam(seen), velocity, "degenerate" if reason else "ok", reason)
 
@@ -141,21 +141,26 @@ class ScanStream:
         """(3,) the velocity that leads from the last pose to this one."""
         return twist.log(se2.compose(se2.inverse(self._pose), pose)) / interval
 
-    def _match(self, scan: Scan, grid: ScanGrid, reference: View, predicted: Floats) -> PairPrediction:
-        """The scan matched to an earlier one: a pair's answer labels its source, so that is the new scan."""
+    def _match(self, scan: Scan, grid: ScanGrid, reference: View, predicted: Floats) -> tuple[PairPrediction, Votes]:
+        """The scan matched to an earlier one, and the votes of others; both by beam.
+
+        A pair's answer labels its source, so that is the new scan.
+        """
         assert self._keyframe is not None
         near = place(grid, self._keyframe.background, se2.compose(se2.inverse(self._keyframe.pose), predicted))
         pose = se2.compose(self._keyframe.pose, near.motion)
         if near.share < DOUBTED or np.abs(se2.compose(se2.inverse(predicted), pose)).max() > ASTRAY:
             pose = predicted
-        expected = self._objects.expect(grid, pose, reference, self._now)
+        votes = self._objects.memory.look(grid, pose)
+        expected = self._objects.expect(grid, votes, pose, reference, self._now)
         guess = se2.compose(se2.inverse(reference.pose), pose).tolist()
-        return self.model.match(scan, reference.scan, self._now - reference.time, initial_motion=guess, expected=expected)
+        found = self.model.match(scan, reference.scan, self._now - reference.time, initial_motion=guess, expected=expected)
+        return found, votes.by_beam(scan)
 
-    def _place(self, scan: Scan, labels: Ints, guess: Floats, reference: View, predicted: Floats) -> _Placed:
+    def _place(self, scan: Scan, grid: ScanGrid, labels: Ints, guess: Floats, reference: View, predicted: Floats) -> _Placed:
         """The scan's background on the keyframe, or on the scan before if that explains it much better.
 
-        labels: (n_beams,). guess: (3,) a good one of the pose.
+        grid: of the scan. labels: (n_beams,). guess: (3,) a good one of the pose.
         """
         assert self._keyframe is not None
         background = grid_at(scan, scan.points[labels[scan.beam] == BACKGROUND])
@@ -170,7 +175,6 @@ class ScanStream:
         pose, covariance = se2.compose(frame.pose, placement.motion), world_covariance(placement.covariance, frame.pose)
         if self._has_velocity or self._is_led:
             pose = fused(predicted, pose, covariance, self._now - self._history.last.time)
-        grid = grid_at(scan, scan.points)
         is_less = explains_less(pose, guess, grid, reference)  # what is not observed was predicted wrongly
         pose, on_keyframe = (guess, False) if is_less else (pose, on_keyframe)
         view = View(scan, grid, background, pose, self._now)
@@ -238,7 +242,9 @@ class ScanStream:
 
 
 def explains_less(pose: Floats, guess: Floats, grid: ScanGrid, reference: View) -> bool:
-    """Whether a pose (3,) explains far less of a scan than a guess (3,) of it, on an earlier scan."""
+    """Whether a pose (3,) explains far less of a scan, on an earlier one, than a guess (3,) that is not near it."""
+    if np.abs(se2.compose(se2.inverse(pose), guess)).max() < ALIKE:
+        return False
     shares = [explained_by(se2.compose(se2.inverse(reference.pose), at), grid, reference.grid).mean() for at in (pose, guess)]
     return bool(shares[0] < LEAST_OF_BEST * shares[1])
 
