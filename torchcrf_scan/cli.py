@@ -14,6 +14,7 @@ from jsonargparse import ArgumentParser
 
 from torchcrf_scan import __version__
 from torchcrf_scan.commands.bench import bench
+from torchcrf_scan.commands.drives import drives
 from torchcrf_scan.commands.evaluate import evaluate
 from torchcrf_scan.commands.experiment import experiment, experiment_parser
 from torchcrf_scan.commands.failures import one_line
@@ -31,6 +32,7 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
     "plot": plot,
     "listen": listen,
     "bench": bench,
+    "drives": drives,
     "prepare": prepare,
 }
 

@@ -26,9 +26,14 @@ class Clock:
         self._has_started = self._has_warned = False
 
     @property
+    def known(self) -> float | None:
+        """Seconds, the median of the last intervals; None before there is one."""
+        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else None
+
+    @property
     def usual(self) -> float:
-        """Seconds, the median of the last intervals."""
-        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else USUAL
+        """Seconds between scans as far as known."""
+        return self.known or USUAL
 
     def advance(self, stamp: float) -> float:
         """Seconds since the scan before, above 0; 0 at the first scan. stamp: seconds, of the new scan."""
