@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,4 @@ def test_a_short_drive_is_scored(tmp_path: Path, capsys: pytest.CaptureFixture[s
 )
 def test_wrong_options_are_named(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("drives", *arguments) == 1
-    import re
-
     assert re.search(message, capsys.readouterr().err)

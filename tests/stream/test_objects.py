@@ -7,7 +7,14 @@ from torchcrf_scan import PairPrediction
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats, Ints
 from torchcrf_scan.stream.memory import Votes
-from torchcrf_scan.stream.objects import Clusters, clusters_over_ground, with_expected, with_segments_filled, with_standing_removed
+from torchcrf_scan.stream.objects import (
+    Clusters,
+    clusters_over_ground,
+    turns_over_ground,
+    with_expected,
+    with_segments_filled,
+    with_standing_removed,
+)
 from torchcrf_scan.stream.tracks import TrackPrediction
 from torchcrf_scan.stream.view import View
 
@@ -58,6 +65,21 @@ def test_velocity_over_ground_of_a_box_seen_from_a_turning_sensor() -> None:
     c, s = np.cos(0.3), np.sin(0.3)
     turn = np.array([[c, -s], [s, c]])
     np.testing.assert_allclose(seen.covariance[0], turn @ np.diag([1e-4, 4e-4]) @ turn.T / dt**2, atol=1e-9)
+
+
+def test_how_fast_a_mover_turns_over_ground() -> None:
+    before, now, dt, rate = np.array([0.3, 1.0, 2.0]), np.array([0.5, 1.2, 2.1]), 0.2, 0.7
+    reference, view = View.of(scan_at(before, box(4, 3)), before, 0.0), View.of(scan_at(now, box(4, 3), 1), now, dt)
+    back = np.array([-rate * dt, 0.3, -0.1])  # of the mover, from now to before, in the world
+    found = PairPrediction(
+        association=np.zeros(view.scan.n_beams, np.int64),
+        cluster=np.ones(view.scan.n_beams, np.int64),
+        motions=np.stack([se2.compose(se2.inverse(before), of) for of in (now, se2.compose(back, now))]),
+        association_confidence=np.ones(view.scan.n_beams),
+        cluster_confidence=np.ones(view.scan.n_beams),
+        converged=True,
+    )
+    np.testing.assert_allclose(turns_over_ground(view, found, reference, 2), [rate, np.nan], atol=1e-9)
 
 
 def test_a_cluster_that_has_stood_is_background() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_format
+import math
 from pathlib import Path
 
 from torchcrf_scan.commands.arguments import load_model
@@ -68,7 +69,9 @@ def drives(
 
 
 def _shown(key: str, value: float) -> str:
-    """A number of a table."""
+    """A number of a table; nothing where there was nothing to measure, such as a path of 10 m."""
+    if math.isnan(value):
+        return ""
     if key in ("movers", "id_switches"):
         return f"{value:.0f}"
     return (

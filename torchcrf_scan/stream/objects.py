@@ -88,7 +88,9 @@ class Objects:
         seen = with_expected(seen, votes, points, self.tracker.predict(view.time))
         self.memory.add(view)
         sensor = view.pose[1:]
-        numbers, objects = self.tracker.update(view.time, points, seen.label, seen.velocity, seen.covariance, sensor)
+        since = view.time - reference.time
+        turns = turns_over_ground(view, found, reference, len(seen.velocity))
+        numbers, objects = self.tracker.update(view.time, points, seen.label, seen.velocity, seen.covariance, sensor, since, turns)
         movers = self._that_moved(objects)
         known = np.where(np.isin(numbers, [of.number for of in movers]), numbers, OUTLIER)
         track = np.concatenate([[BACKGROUND], known, [OUTLIER]])[seen.label]  # label -1 is the last
@@ -130,6 +132,13 @@ def clusters_over_ground(view: View, cluster: Ints, found: PairPrediction, refer
         turn = se2.rotate(reference.pose[:1], np.eye(2)).T
         covariance[k - 1] = turn @ lever @ found.covariances[k] @ lever.T @ turn.T / dt**2
     return Clusters(cluster.copy(), velocity, covariance)
+
+
+def turns_over_ground(view: View, found: PairPrediction, reference: View, K: int) -> Floats:
+    """(K,) rad/s at which the clusters of a match rotate in the world; NaN for those that it did not find."""
+    turns = np.full(K, np.nan)
+    turns[: len(found.motions) - 1] = se2.wrap(view.pose[0] - reference.pose[0] - found.motions[1:, 0])
+    return turns / (view.time - reference.time)
 
 
 def with_standing_removed(seen: Clusters, votes: Votes) -> Clusters:
