@@ -14,14 +14,15 @@ from jsonargparse import ArgumentParser
 
 from torchcrf_scan import __version__
 from torchcrf_scan.commands.bench import bench
+from torchcrf_scan.commands.drives import drives
 from torchcrf_scan.commands.evaluate import evaluate
 from torchcrf_scan.commands.experiment import experiment, experiment_parser
 from torchcrf_scan.commands.failures import one_line
+from torchcrf_scan.commands.listen import listen
 from torchcrf_scan.commands.match import match
 from torchcrf_scan.commands.plot import plot
 from torchcrf_scan.commands.prepare import prepare
 from torchcrf_scan.commands.simulate import simulate
-from torchcrf_scan.data.formats import ENDINGS
 
 COMMANDS: Mapping[str, Callable[..., int]] = {
     "simulate": simulate,
@@ -29,14 +30,17 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
     "evaluate": evaluate,
     "experiment": experiment,
     "plot": plot,
+    "listen": listen,
     "bench": bench,
+    "drives": drives,
     "prepare": prepare,
 }
 
+LOGS = "CARMEN, bags of ROS 1 and 2, MCAP, CSV"
 POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: metavar, nargs (None: exactly one), help
-    "files": ("PAIR.npz|LOG", "+", f"pair files (.npz), folders of them, logs ({ENDINGS}), or glob patterns"),
+    "files": ("PAIR.npz|LOG", "+", f"pair files (.npz), folders of them, logs ({LOGS}), or glob patterns"),
     "pair_files": ("PAIR.npz", "+", "pair files (.npz), folders of them, or glob patterns"),
-    "file": ("PAIR.npz|LOG", None, f"a pair file (.npz), or with --number a log ({ENDINGS})"),
+    "file": ("PAIR.npz|LOG", None, f"a pair file (.npz), or with --number a log ({LOGS})"),
 }
 
 

@@ -17,7 +17,7 @@ from torchcrf_scan.checks import from_values
 from torchcrf_scan.config import RUN_TIME, InferenceConfig, ModelConfig
 from torchcrf_scan.whole_file import write_whole
 
-PRETRAINED = "simulated"
+PRETRAINED = "encoder"
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PADDED = "thresholds"  # suffix of the names of tensors that are padded with infinity
 

@@ -166,9 +166,39 @@ def test_a_broken_log_does_not_lose_the_others(
     assert run("match", broken, short, log_file, "--every=2", "--output", tmp_path / "out", "--model", model_dir) == 1
     out, err = capsys.readouterr()
     assert "2 of 2 pairs matched" in out
-    for message, line in zip((f"{broken}, line 2: expected", f"{short}: expected at least two"), err.splitlines(), strict=True):
+    for message, line in zip(
+        (f"{broken}, line 2 (byte {len(lines[0]) + 1}): expected", f"{short}: expected at least two"), err.splitlines(), strict=True
+    ):
         assert message in line
     assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+def test_a_cut_log_gives_its_whole_pairs(
+    log_file: Path, model_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = gzip.decompress(log_file.read_bytes()).decode()
+    (tmp_path / "cut.txt").write_text(text[:-100])
+    assert run("match", tmp_path / "cut.txt", "--output", tmp_path / "out", "--model", model_dir) == 1
+    out, err = capsys.readouterr()
+    assert "3 of 3 pairs matched" in out
+    assert "line 5" in err.splitlines()[-1]
+
+
+def test_match_reads_bags(
+    log_file: Path, pairs_dir: Path, model_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rosbags", reason="the library rosbags is not installed (extra `ros`)")
+    from bags import drive, write
+
+    bag = write(tmp_path, "mcap", [*drive(3, "/front"), *drive(3, "/rear")])
+    options = ["--output", tmp_path / "out", "--model", model_dir]
+    assert run("match", bag, "--topic", "/front", *options) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["mcap_00000.npz", "mcap_00001.npz"]
+    capsys.readouterr()
+    assert run("match", bag, *options) == 1
+    assert "topic: expected which of /front (sensor_msgs/LaserScan), /rear" in capsys.readouterr().err
+    message = fail(capsys, "match", pairs_dir, "--topic", "/front", *options)
+    assert "--topic, --odometry, --no_return: expected a log to read with them, got pair files alone" in message
 
 
 def test_match_refuses_two_pairs_of_one_name(

@@ -1,34 +1,76 @@
-"""Which files are recordings, and what reads them."""
+"""Formats are recognised by what a file holds."""
 
+import gzip
+import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from torchcrf_scan.data.carmen import CarmenLog
-from torchcrf_scan.data.formats import read_recording, reader_of
+from torchcrf_scan.data.carmen import read_carmen
+from torchcrf_scan.data.formats import FORMATS, PAIR, find_format, is_recording, read_recording, read_scans
+from torchcrf_scan.data.pair_file import write_pair
+from torchcrf_scan.scan import Scan, ScanPair
 
 READING = "FLASER 3 1.00 1.10 1.20 0 0 0 0 0 0 {stamp:.2f} robot {stamp:.2f}\n"
+CARMEN = "# a log\n" + "".join(READING.format(stamp=k / 10) for k in range(3))
 
 
-@pytest.mark.parametrize("name", ["run.log", "run.log.gz", "2003.10.12.log"])
-def test_a_carmen_log_is_known_by_its_name(name: str) -> None:
-    assert reader_of(Path("folder") / name) is CarmenLog
+def name_of(path: Path) -> str | None:
+    form = find_format(path)
+    return None if form is None else form.name
 
 
-@pytest.mark.parametrize("name", ["log.npz", "a.gz", "log", "run.log.txt"])
-def test_other_files_are_no_recordings(name: str) -> None:
-    assert reader_of(Path("folder.log") / name) is None
-    with pytest.raises(ValueError, match=r"expected a recording \(\.log, \.log\.gz\)"):
-        read_recording(Path("folder.log") / name)
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [
+        (CARMEN.encode(), "CARMEN log"),
+        (gzip.compress(CARMEN.encode()), "CARMEN log"),
+        (b"PARAM a b\r\n\tODOM \xe4\n", "CARMEN log"),
+        (b"stamp,0.0,0.1\n", "CSV of ranges"),
+        (gzip.compress(b'\xef\xbb\xbf"stamp",0.0,0.1\n'), "CSV of ranges"),
+        (b"#ROSBAG V2.0\n\0\0", "ROS 1 bag"),
+        (b"\x89MCAP0\r\n\1", "MCAP file"),
+        (b"SQLite format 3\0", "ROS 2 database"),
+        (b"PK\3\4", "pair file"),
+        (b"", None),
+        (b"  \n", None),
+        (b"\x93NUMPY\1\0", None),
+        (pickle.dumps([1, 2]), None),
+        (b"\x1f\x8b\x08\0", None),
+        (bytes(1000), None),
+    ],
+)
+@pytest.mark.parametrize("file", ["run.log", "run.npz", "run"])
+def test_a_file_is_known_by_its_content(tmp_path: Path, content: bytes, name: str | None, file: str) -> None:
+    path = tmp_path / file
+    path.write_bytes(content)
+    assert name_of(path) == name
+    assert is_recording(path) == (name not in (None, PAIR.name))
+    if name is None:
+        with pytest.raises(ValueError, match=r": expected one of pair file, ROS 1 bag, .*, got none of these$") as error:
+            read_scans(path)
+        assert "pickle" not in str(error.value)
+
+
+def test_a_folder_is_known_by_its_metadata(tmp_path: Path) -> None:
+    assert find_format(tmp_path) is None
+    (tmp_path / "metadata.yaml").write_text("a: b")
+    assert name_of(tmp_path) == "folder of ROS 2"
+
+
+def test_every_format_has_its_name() -> None:
+    assert len({form.name for form in FORMATS}) == len(FORMATS)
 
 
 def test_a_recording_has_the_pairs_of_consecutive_scans(tmp_path: Path) -> None:
-    path = tmp_path / "run.log"
-    path.write_text("".join(READING.format(stamp=k / 10) for k in range(3)))
+    path = tmp_path / "run.txt"
+    path.write_text(CARMEN)
     recording = read_recording(path)
     assert len(recording) == 2
-    assert recording[1].name == recording.pair_name(1) == "run_00001"
+    assert recording[1].name == recording.pair_name(1) == "run.txt_00001"
     assert recording[1].dt == pytest.approx(0.1)
+    assert [reading.stamp for reading in read_scans(path)] == [reading.stamp for reading in read_carmen(path)]
 
 
 def test_one_scan_makes_no_pair(tmp_path: Path) -> None:
@@ -36,3 +78,12 @@ def test_one_scan_makes_no_pair(tmp_path: Path) -> None:
     path.write_text(READING.format(stamp=0.0))
     with pytest.raises(ValueError, match=r"run\.log: expected at least two scans, got one$"):
         read_recording(path)
+
+
+def test_a_pair_file_is_two_scans(tmp_path: Path) -> None:
+    scans = [Scan.from_ranges([1.0, np.nan, 2.0 + k], [0.2, 0.1, 0.0]) for k in range(2)]
+    write_pair(tmp_path / "pair.npz", ScanPair(*scans, 0.25))
+    first, second = read_scans(tmp_path / "pair.npz")
+    assert (first.stamp, second.stamp) == (0.0, 0.25)
+    np.testing.assert_array_equal(second.scan.ranges, scans[1].ranges)
+    assert read_recording(tmp_path / "pair.npz")[0].dt == 0.25

@@ -88,7 +88,15 @@ def test_similarities_are_shares(labels: list[tuple[int, int]]) -> None:
 
 
 def test_distances() -> None:
-    frame = frame_of_positions(np.array([1, 2]), np.array([[0.0, 0], [5, 0]]), np.array([3]), np.array([[0.0, 0.5]]), 2.0)
+    everyone = np.ones(2, dtype=bool)
+    frame = frame_of_positions(np.array([1, 2]), np.array([[0.0, 0], [5, 0]]), everyone, np.array([3]), np.array([[0.0, 0.5]]), 2.0)
     np.testing.assert_allclose(frame.similarity, [[0.75], [0.0]])
-    empty = frame_of_positions(np.zeros(0, int), np.zeros((0, 2)), np.array([3]), np.array([[0.0, 0.5]]), 2.0)
+    empty = frame_of_positions(np.zeros(0, int), np.zeros((0, 2)), everyone[:0], np.array([3]), np.array([[0.0, 0.5]]), 2.0)
     assert empty.similarity.shape == (0, 1)
+
+
+def test_who_is_hidden_need_not_be_found_and_may_be_predicted() -> None:
+    asked, positions = np.array([True, False]), np.array([[0.0, 0.3], [5.0, 0.9], [9.0, 0.0]])
+    frame = frame_of_positions(np.array([1, 2]), np.array([[0.0, 0], [5, 0]]), asked, np.array([3, 4, 5]), positions, 2.0)
+    np.testing.assert_array_equal(frame.true, [1])
+    np.testing.assert_array_equal(frame.found, [3, 5])

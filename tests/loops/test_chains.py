@@ -67,6 +67,15 @@ def test_totals_without_a_state() -> None:
         assert_close(without[:, state], total_in_tensors(left, edges))
 
 
+@pytest.mark.parametrize("scale", [0.0, 3.0])
+def test_totals_of_a_long_chain_stay_in_range(scale: float) -> None:
+    """900 alike nodes, as of padding, have 8^900 labellings: more than a double holds."""
+    nodes, edges = scale * normal(2, 900, 8, seed=1), scale * normal(2, 899, 8, 8, seed=2)
+    whole, without = totals_without(nodes, edges)
+    assert_close(whole, total_in_tensors(nodes, edges))
+    assert_close(without[:, 3], total_in_tensors(nodes.index_fill(2, torch.tensor([3]), -torch.inf), edges))
+
+
 def test_impossible_chains() -> None:
     nodes = torch.full((1, 3, 2), -torch.inf, dtype=torch.float64, requires_grad=True)
     edges = torch.zeros(1, 2, 2, 2, dtype=torch.float64)

@@ -9,10 +9,12 @@ from typing import Any, TypeVar
 
 import torch
 
-from torchcrf_scan.commands.failures import attempt
+from torchcrf_scan.commands.failures import attempt, one_line
 from torchcrf_scan.data.dataset import PairFiles
-from torchcrf_scan.data.formats import ENDINGS, Recording, read_recording, reader_of
+from torchcrf_scan.data.formats import is_recording, read_recording
+from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
 from torchcrf_scan.data.pair_file import read_pair
+from torchcrf_scan.data.recording import Recording
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
 
@@ -64,32 +66,36 @@ def find_files(patterns: Sequence[str]) -> list[Path]:
     return [place.path for place in _each_once(PairPlace(path) for path in PairFiles(*patterns).paths)]
 
 
-def find_pairs(patterns: Sequence[str], every: int, failures: list[str]) -> list[PairPlace]:
+def find_pairs(patterns: Sequence[str], every: int, failures: list[str], options: ReadOptions = AS_RECORDED) -> list[PairPlace]:
     """The pairs of the matching files, each once, of logs every N-th; raises ValueError for two of the same name.
 
-    A log that cannot be read contributes none; the reason is added to `failures`.
+    A log that cannot be read contributes none, one that is damaged those before the fault; the reason is added to `failures`.
     """
     paths = PairFiles(*patterns).paths
     if every < 1:
         raise ValueError(f"--every: expected at least 1, got {every}")
-    if every > 1 and not any(reader_of(path) for path in paths):
-        raise ValueError(f"--every: expected a log ({ENDINGS}) to take every {every}-th pair of, got pair files alone")
+    logs = {path for path in paths if attempt([], is_recording, path)}
+    if not logs and (every > 1 or options != AS_RECORDED):
+        every_nth = f"--every: expected a log to take every {every}-th pair of"
+        told = every_nth if every > 1 else "--topic, --odometry, --no_return: expected a log to read with them"
+        raise ValueError(f"{told}, got pair files alone")
     found = []
     for path in paths:
-        if reader_of(path) is None:
+        if path not in logs:
             found.append(PairPlace(path))
-        elif (log := attempt(failures, read_recording, path)) is not None:
+        elif (log := attempt(failures, read_recording, path, options)) is not None:
             found += [PairPlace(path, log, number) for number in range(0, len(log), every)]
+            failures += [] if log.fault is None else [one_line(log.fault)]
     return _each_once(found)
 
 
-def read_one(file: str, number: int | None) -> ScanPair:
+def read_one(file: str, number: int | None, options: ReadOptions = AS_RECORDED) -> ScanPair:
     """The pair of a pair file (number None), or one of the pairs of a log."""
-    if reader_of(file) is None:
+    if not is_recording(file):
         if number is not None:
-            raise ValueError(f"--number: expected none but with a log ({ENDINGS}), got {number} with {file}")
+            raise ValueError(f"--number: expected none but with a log, got {number} with {file}")
         return read_pair(file)
-    log = read_recording(file)
+    log = read_recording(file, options)
     if number is None or not 0 <= number < len(log):
         raise ValueError(f"--number: expected which pair of {file}, 0 to {len(log) - 1}, got {number}")
     return log[number]

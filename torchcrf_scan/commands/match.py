@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from torchcrf_scan.commands.arguments import batches, find_pairs, load_model, make_folder
 from torchcrf_scan.commands.failures import attempt, one_line
+from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.velocity import ground_velocity
@@ -25,6 +26,9 @@ def match(
     output: str,
     *,
     every: int = 1,
+    topic: str | None = None,
+    odometry: str | None = None,
+    no_return: float | None = None,
     model: str = PRETRAINED,
     candidates: int | None = None,
     device: str = "cpu",
@@ -32,20 +36,24 @@ def match(
 ) -> int:
     """Matches scan pairs: writes OUTPUT/<name of the pair>.npz for each and prints the motions of the sensor and the movers.
 
-    A pair is a file, or two consecutive readings of a log; those of run.log are named run_00000, run_00001 and so on. Earlier
-    predictions are replaced, other files never. Files that cannot be read or written are skipped and reported at the end.
+    A pair is a file, or two consecutive scans of a log; those of run.log are named run_00000, run_00001 and so on. The format of
+    a log (CARMEN, bags of ROS 1 and 2, MCAP, CSV) is recognised. Earlier predictions are replaced, other files never. Files that
+    cannot be read or written are skipped and reported at the end.
 
     Args:
         files: pair files and logs
         output: folder of the prediction files, created if necessary
         every: takes each N-th pair of a log only
+        topic: topic of the scans in a bag, if there are several; of a CARMEN log the kind of lines, e.g. RLASER
+        odometry: topic of odometry in a bag, or auto, for first guesses of the motions; other logs' odometry is used anyway
+        no_return: readings in metres from there on mean that nothing came back; by default as the log says or shows
         model: folder of a saved model, or the name of one that the package ships
         candidates: target points considered for each source point, 0 for all; by default as the model was saved
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; by default its own choice
     """
     failures: list[str] = []
-    places = find_pairs(files, every, failures)
+    places = find_pairs(files, every, failures, ReadOptions(topic, odometry, no_return))
     targets = {place.name: _prediction_path(place.name, Path(output)) for place in places}
     network = load_model(model, candidates, device, threads)
     make_folder("--output", output)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from torchcrf_scan.data.laser import NO_BODY
 from torchcrf_scan.data.world import Mover
@@ -58,18 +59,12 @@ def _associate(moved: Floats, seen: Floats, body: Ints, target: Capture, target_
     association = np.full(len(moved), OUTLIER)
     if not len(moved) or not len(target_body):
         return association
-    is_near = _distances(moved, target.settled) <= association_gate(target.spacing, config)
-    distance = np.where((body[:, None] == target_body) & is_near, _distances(seen, target.scan.points), np.inf)
+    is_near = cdist(moved, target.settled) <= association_gate(target.spacing, config)
+    distance = np.where((body[:, None] == target_body) & is_near, cdist(seen, target.scan.points), np.inf)
     nearest = distance.argmin(1)
     found = np.isfinite(distance[np.arange(len(moved)), nearest])
     association[found] = nearest[found]
     return association
-
-
-def _distances(points: Floats, others: Floats) -> Floats:
-    """(N, M) distances between (N, 2) and (M, 2) points."""
-    offset = points[:, None, :] - others  # (N, M, 2)
-    return np.hypot(offset[..., 0], offset[..., 1])
 
 
 def annotate(source: Capture, target: Capture, config: SimulatorConfig) -> Annotation:

@@ -1,117 +1,81 @@
-"""CARMEN logs (`FLASER n r1..rn x y theta odom_x odom_y odom_theta t host t`), plain or gzipped, as a sequence of scan pairs."""
+"""CARMEN logs, plain or gzipped, read line by line; `CarmenLog` makes pairs of them."""
 
 from __future__ import annotations
 
-import gzip
-import math
-import zlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 
-from torchcrf_scan.scan import Floats, Scan, ScanPair
-
-NO_RETURN = 50.0  # metres; larger readings are beams without return (SICK LMS: 51 or 81.9)
-FIELD_OF_VIEW = math.pi  # of the front laser; not stated in the format
-TAIL = 9  # number of fields after the ranges
-
-
-@dataclass(frozen=True, slots=True)
-class CarmenScan:
-    """One reading.
-
-    Attributes:
-        scan: the valid returns.
-        stamp: seconds.
-        pose: (x, y, theta) of the sensor, metres and radians; corrected if the log is.
-        odometry: (x, y, theta) from the wheels.
-    """
-
-    scan: Scan
-    stamp: float
-    pose: Floats
-    odometry: Floats
+from torchcrf_scan.data.carmen_line import LaserLine, bearings_of, kind_of, read_laser_line
+from torchcrf_scan.data.carmen_survey import ROUNDING, Survey, survey
+from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
+from torchcrf_scan.data.reading import Reading
+from torchcrf_scan.data.recording import Recording
+from torchcrf_scan.data.text_lines import Line, read_lines
+from torchcrf_scan.geometry import se2
+from torchcrf_scan.scan import Floats, Scan
 
 
-class CarmenLog(Sequence[ScanPair]):
-    """The pairs of consecutive readings of the front laser, in the order of the file; pairs are made on demand.
+def read_carmen(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iterator[Reading]:
+    """The scans of one laser of a log, in the order of the file; the front laser's where none is asked for.
 
-    Args:
-        path: log file, `.gz` or not.
-        no_return: metres; larger readings are beams without return.
-
-    Attributes:
-        scans: all S readings; there are S - 1 pairs, none if S < 2.
+    PARAM lines give field of view, step and greatest range of a laser whose lines do not; readings that mean "no return" are
+    found in the log (`no_return`). Odometry is that of the sensor; for RAWLASER lines, of the ODOM line before them.
 
     Raises:
-        ValueError: a file that cannot be read, without readings, or with a malformed reading; names file and line.
+        ValueError: no scans; or, after every scan before it, a malformed line or damaged file, with line and byte.
+        OSError: the file cannot be opened.
+    """
+    path = Path(path)
+    known = survey(path, options)
+    odometry: Floats | None = None
+    for line in read_lines(path):
+        if line.text.startswith("ODOM "):
+            odometry = _read_odometry(line)
+        elif kind_of(line.text) == known.kind:
+            yield _reading(read_laser_line(line, known.kind), known, odometry, line.where)
+
+
+def _reading(laser: LaserLine, known: Survey, odometry: Floats | None, where: str) -> Reading:
+    limit = known.no_return if laser.limit is None else min(known.no_return, laser.limit - ROUNDING)
+    count = len(laser.ranges)
+    if laser.start is None or laser.step is None:
+        bearings = bearings_of(count, known.fov, known.step)
+    else:
+        bearings = laser.start + laser.step * np.arange(count, dtype=np.float64)
+    try:
+        scan = Scan.from_ranges(np.where(laser.ranges >= limit, np.nan, laser.ranges), bearings)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    robot = odometry if laser.robot is None else laser.robot
+    sensor = None if robot is None else se2.compose(robot, known.mount)
+    return Reading(scan, float(laser.stamps[known.clock]), sensor, laser.pose)
+
+
+def _read_odometry(line: Line) -> Floats | None:
+    """(3,) pose of an ODOM line, `ODOM x y theta ...`; None if it is malformed: the scans do not need it."""
+    try:
+        x, y, theta = (float(value) for value in line.text.split()[1:4])
+    except ValueError:
+        return None
+    pose = np.array([theta, x, y])
+    return pose if np.isfinite(pose).all() else None
+
+
+class CarmenLog(Recording):
+    """The pairs of consecutive scans of one laser of a log.
+
+    Args:
+        path: log file, gzipped or not.
+        no_return: metres; readings from there on are beams without return. None: as the log says or shows.
+        topic: kind of lines to read; None: those of the front laser.
+
+    Raises:
+        ValueError: fewer than two scans, or a file that cannot be read.
     """
 
-    def __init__(self, path: str | Path, *, no_return: float = NO_RETURN) -> None:
-        self.path = Path(path)
-        self.scans = [
-            read_line(line, no_return, f"{self.path}, line {number}")
-            for number, line in enumerate(read_text(self.path).splitlines(), start=1)
-            if line.startswith("FLASER ")
-        ]
-        if not self.scans:
-            raise ValueError(f"{self.path}: expected lines that start with FLASER, got none")
-
-    def __len__(self) -> int:
-        return len(self.scans) - 1
-
-    @overload
-    def __getitem__(self, index: int) -> ScanPair: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[ScanPair]: ...
-    def __getitem__(self, index: int | slice) -> ScanPair | list[ScanPair]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        k = range(len(self))[index]
-        source, target = self.scans[k], self.scans[k + 1]
-        seconds = max(target.stamp - source.stamp, 1e-3)  # logs are not always in order
-        name, sequence = self.pair_name(k), log_name(self.path)
-        return ScanPair(source.scan, target.scan, seconds, name=name, sequence=sequence, origin=self.path.name)
-
-    def pair_name(self, number: int) -> str:
-        """The name of a pair: that of the log and its number."""
-        return f"{log_name(self.path)}_{number:05d}"
-
-
-def log_name(path: Path) -> str:
-    """The name of a recording: that of the file, without `.log` and `.gz`."""
-    return path.name.removesuffix(".gz").removesuffix(".log")
-
-
-def read_text(path: Path) -> str:
-    """Contents of a text file. Raises ValueError if it is missing or not text."""
-    try:
-        data = path.read_bytes()
-        return (gzip.decompress(data) if path.suffix == ".gz" else data).decode("utf-8", errors="replace")
-    except (OSError, EOFError, zlib.error) as error:
-        raise ValueError(f"{path}: expected a CARMEN log, got {error}") from error
-
-
-def read_line(line: str, no_return: float, where: str) -> CarmenScan:
-    """One FLASER line. where: file and line, for the error."""
-    fields = line.split()
-    try:
-        count = int(fields[1])
-        ranges = np.array(fields[2 : 2 + count], dtype=np.float64)
-        tail = fields[2 + count :]
-        numbers = np.array([*tail[:6], tail[-1]], dtype=np.float64)
-    except (ValueError, IndexError) as error:
-        raise ValueError(f"{where}: expected FLASER with its number of ranges and numbers, got {line[:60]!r}") from error
-    if len(ranges) != count or len(tail) < TAIL:
-        raise ValueError(f"{where}: expected {count} ranges and {TAIL} fields behind them, got {len(fields) - 2} in all")
-    scan = Scan.from_ranges(np.where(ranges >= no_return, np.nan, ranges), bearings_of(count))
-    return CarmenScan(scan, float(numbers[6]), numbers[:3], numbers[3:6])
-
-
-def bearings_of(count: int) -> Floats:
-    """(count,) over 180 degrees: with both ends for an odd number of beams (181, 361), without the last for an even one."""
-    step = FIELD_OF_VIEW / max(count - count % 2, 1)
-    return -FIELD_OF_VIEW / 2 + step * np.arange(count, dtype=np.float64)
+    def __init__(self, path: str | Path, *, no_return: float | None = None, topic: str | None = None) -> None:
+        options = ReadOptions(topic=topic, no_return=no_return)
+        super().__init__(path, partial(read_carmen, path, options))

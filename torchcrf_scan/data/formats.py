@@ -1,48 +1,111 @@
-"""Formats of recordings by file suffix: one file and one line each. All other files are pair files."""
+"""Formats of recordings, recognised by what a file holds, never by its name: one module and one line each."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Protocol, overload
 
-from torchcrf_scan.data.carmen import CarmenLog
-from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.data import mcap_bag, ros1_bag, ros2_bag
+from torchcrf_scan.data.archive import ZIP
+from torchcrf_scan.data.carmen import read_carmen
+from torchcrf_scan.data.csv_scans import FIRST, read_csv_scans
+from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
+from torchcrf_scan.data.pair_file import read_pair_scans
+from torchcrf_scan.data.reading import Reading
+from torchcrf_scan.data.recording import Recording
+from torchcrf_scan.data.ros_bag import read_folder_bag, read_mcap, read_ros1_bag, read_sqlite_bag
+from torchcrf_scan.data.text_lines import open_unpacked
 
+HEAD = 512  # bytes
 
-class Recording(Protocol):
-    """A sequence of pairs of consecutive scans."""
-
-    def __len__(self) -> int: ...
-    @overload
-    def __getitem__(self, index: int) -> ScanPair: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[ScanPair]: ...
-
-    def pair_name(self, number: int) -> str:
-        """The name of a pair: that of the recording and its number."""
+Reader = Callable[[Path, ReadOptions], Iterator[Reading]]
 
 
-FORMATS: Mapping[str, Callable[[str | Path], Recording]] = {".log": CarmenLog, ".log.gz": CarmenLog}  # by suffix
-ENDINGS = ", ".join(FORMATS)
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A format of recordings.
+
+    Attributes:
+        name: for messages. fits: whether a file that begins like this (unpacked if it is gzipped) has it. read: its reader.
+    """
+
+    name: str
+    fits: Callable[[bytes], bool]
+    read: Reader
 
 
-def reader_of(path: str | Path) -> Callable[[str | Path], Recording] | None:
-    """The reader of a recording by its suffix; None for other files."""
-    name = Path(path).name
-    return next((read for ending, read in FORMATS.items() if name.endswith(ending)), None)
+def _begins(start: bytes) -> Callable[[bytes], bool]:
+    return lambda head: head.startswith(start)
 
 
-def read_recording(path: str | Path) -> Recording:
-    """A recording with at least one pair.
+def _is_csv(head: bytes) -> bool:
+    return head.removeprefix(b"\xef\xbb\xbf").replace(b'"', b"").startswith(f"{FIRST},".encode())
+
+
+def _is_text(head: bytes) -> bool:
+    return head.strip() != b"" and not any(byte < 9 or byte in (127, 128, 147) for byte in head)
+
+
+PAIR = Format("pair file", _begins(ZIP), read_pair_scans)
+FOLDER = Format("folder of ROS 2", lambda head: False, read_folder_bag)
+FORMATS = (  # the first that fits
+    PAIR,
+    Format("ROS 1 bag", _begins(ros1_bag.MAGIC), read_ros1_bag),
+    Format("MCAP file", _begins(mcap_bag.MAGIC), read_mcap),
+    Format("ROS 2 database", _begins(ros2_bag.SQLITE), read_sqlite_bag),
+    Format("CSV of ranges", _is_csv, read_csv_scans),
+    Format("CARMEN log", _is_text, read_carmen),
+    FOLDER,
+)
+NAMES = ", ".join(form.name for form in FORMATS)
+
+
+def find_format(path: str | Path) -> Format | None:
+    """The format of a file or folder; None if it is none of `FORMATS`. Raises OSError if it cannot be read."""
+    path = Path(path)
+    if path.is_dir():
+        return FOLDER if ros2_bag.is_folder_bag(path) else None
+    with open_unpacked(path) as file:
+        try:
+            head = file.read(HEAD)
+        except (EOFError, zlib.error):
+            head = b""
+    return next((form for form in FORMATS if form.fits(head)), None)
+
+
+def is_recording(path: str | Path) -> bool:
+    """Whether a file or folder is a recording, and no pair file nor anything else. Raises OSError if it cannot be read."""
+    return find_format(path) not in (PAIR, None)
+
+
+def read_scans(
+    path: str | Path, topic: str | None = None, *, odometry: str | None = None, no_return: float | None = None
+) -> Iterator[Reading]:
+    """The scans of a recording in any format, one at a time; the options are those of `ReadOptions`.
 
     Raises:
-        ValueError: an unknown suffix, a file that cannot be read, or fewer than two scans.
+        ValueError: another format, or what its reader says; of a damaged or cut file after every scan before the fault, with
+            its place.
+        OSError: the file cannot be opened.
     """
-    read = reader_of(path)
-    if read is None:
-        raise ValueError(f"{path}: expected a recording ({ENDINGS}), got another name")
-    recording = read(path)
-    if not len(recording):
-        raise ValueError(f"{path}: expected at least two scans, got one")
-    return recording
+    return _reader(path)(Path(path), ReadOptions(topic, odometry, no_return))
+
+
+def read_recording(path: str | Path, options: ReadOptions = AS_RECORDED) -> Recording:
+    """The pairs of consecutive scans of a recording in any format.
+
+    Raises:
+        ValueError: another format, a file that cannot be read, or fewer than two scans.
+        OSError: the file cannot be opened.
+    """
+    return Recording(path, partial(_reader(path), Path(path), options))
+
+
+def _reader(path: str | Path) -> Reader:
+    form = find_format(path)
+    if form is None:
+        raise ValueError(f"{path}: expected one of {NAMES}, got none of these")
+    return form.read

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -21,6 +21,10 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcrf_scan.data.archive import read_arrays
+from torchcrf_scan.data.limits import MOST_BEAMS
+from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
+from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.scan import OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, Scan, ScanPair, check_sensor
 
 _KINDS: dict[str, tuple[str, type]] = {
@@ -108,7 +112,7 @@ def read_pair(path: str | Path) -> ScanPair:
         ValueError: not an `.npz`, truncated, object arrays, a key that is missing or wrong (the message names it).
         OSError: the file cannot be opened.
     """
-    return _parse_pair(_load(Path(path), _PAIR_KEYS))
+    return _parse_pair(_Fields(Path(path), read_arrays(Path(path), _PAIR_KEYS)))
 
 
 def write_pair(path: str | Path, pair: ScanPair) -> None:
@@ -125,6 +129,16 @@ def write_pair(path: str | Path, pair: ScanPair) -> None:
     _save(fields)
 
 
+def read_pair_scans(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iterator[Reading]:
+    """Both scans of a pair file as a recording that begins at 0 s; raises the errors of `read_pair`.
+
+    options: ignored, as a pair file says everything.
+    """
+    pair = read_pair(path)
+    yield Reading(pair.source, 0.0)
+    yield Reading(pair.target, pair.dt)
+
+
 def read_prediction(path: str | Path) -> PairPrediction:
     """Reads a prediction file.
 
@@ -132,7 +146,7 @@ def read_prediction(path: str | Path) -> PairPrediction:
         ValueError: not an `.npz`, truncated, object arrays, a key that is missing or wrong (the message names it).
         OSError: the file cannot be opened.
     """
-    return _parse_prediction(_load(Path(path), (*_PREDICTION_KEYS, *_CERTAINTY_KEYS)))
+    return _parse_prediction(_Fields(Path(path), read_arrays(Path(path), (*_PREDICTION_KEYS, *_CERTAINTY_KEYS))))
 
 
 def write_prediction(path: str | Path, prediction: PairPrediction) -> None:
@@ -167,6 +181,8 @@ def _parse_sensor(fields: _Fields) -> dict[str, float | None]:
 
 def _parse_scan(fields: _Fields, side: str, sensor: dict[str, float | None]) -> Scan:
     ranges = fields.get(f"{side}_ranges", "float", "N" if side == "source" else "M")
+    if len(ranges) > MOST_BEAMS:
+        fields.fail(f"{side}_ranges", f"at most {MOST_BEAMS} beams", len(ranges))
     key = f"{side}_bearings"
     bearings = fields.get(key, "float", len(ranges))
     fields.require(key, bearings, np.isfinite(bearings), "finite bearings")
@@ -254,19 +270,6 @@ def _annotation_arrays(annotation: Annotation, is_return: Bools) -> dict[str, ND
     if arrays["ignore"].shape == is_return.shape:  # otherwise the reader's check raises
         arrays["ignore"] = arrays["ignore"] | ~is_return
     return arrays
-
-
-def _load(path: Path, keys: Sequence[str]) -> _Fields:
-    """Reads the known keys of an archive; errors of numpy and zipfile for a damaged one are raised as ValueError."""
-    with open(path, "rb") as file:
-        try:
-            archive = np.load(file, allow_pickle=False)
-            with archive:
-                arrays = {key: np.asarray(archive[key]) for key in keys if key in archive}
-        except Exception as error:
-            got = f"{type(error).__name__}: {error}"
-            raise ValueError(f"{path}: expected a complete .npz archive without object arrays, got {got}") from error
-    return _Fields(path, arrays)
 
 
 def _save(fields: _Fields) -> None:

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from torchcrf_scan.data.annotate import STATIC, Capture, annotate
-from torchcrf_scan.data.laser import NO_BODY, Hits, beam_bearings, cast, in_view, measure
+from torchcrf_scan.data.laser import Hits, beam_bearings, cast, in_view, measure
 from torchcrf_scan.data.world import Mover, Shapes, Viewer, World, draw_mover, indoor, littered, street
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
@@ -63,6 +63,25 @@ def _steer(start: Floats, world: World, pairs: int, speed: float, bend: float, l
     return np.stack(poses)
 
 
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Beams that are cast together.
+
+    Attributes:
+        beams: their indices. late: seconds from the middle of the sweep to their time.
+        pose: (3,) of the sensor in the world at that time.
+    """
+
+    beams: slice
+    late: float
+    pose: Floats
+
+    @property
+    def from_world(self) -> Floats:
+        """(3,) motion of the world into the sensor's frame."""
+        return se2.inverse(self.pose)
+
+
 @dataclass
 class _Drive:
     """A sequence under construction: the world, the sensor's path (T, 3) at `times` (T,), and the kinds of movers wanted.
@@ -80,10 +99,11 @@ class _Drive:
     movers: dict[int, Mover] = field(default_factory=dict)  # by index in `kinds`
     unseen: dict[int, int] = field(default_factory=dict)  # scans since it was seen, by number
     born: int = 0
+    sweep: list[Part] = field(default_factory=list)  # of the present scan
 
     def capture(self, i: int) -> Capture:
         """The scan at time i; movers that were out of sight for too long (all, at first) are replaced by new ones."""
-        config, rng = self.config, self.rng
+        config, rng, self.sweep = self.config, self.rng, self._sweep(i)
         hits = self._cast(lambda _: self.world.shapes, STATIC, i)
         for mover in self.movers.values():
             hits = hits.nearer(self._cast(mover.at, mover.number, i))
@@ -97,41 +117,39 @@ class _Drive:
         settled = self._settle(scan.points, beam, body, i, movers)
         return Capture(scan, body, spacing, settled, self.times[i], self.path[i], movers)
 
-    def _sweep(self) -> list[tuple[slice, float]]:
-        """The beams that are cast together, and the seconds from the middle of the sweep to their time."""
-        if self.config.sweep == 0:
-            return [(slice(0, self.config.beams), 0.0)]
-        edges = np.linspace(0, self.config.beams, SWEEP_PARTS + 1).round().astype(int)
-        return [(slice(a, b), self.config.sweep * ((a + b) / (2 * self.config.beams) - 0.5)) for a, b in pairwise(edges) if a < b]
-
-    def _pose(self, i: int, late: float) -> Floats:
-        """(3,) the sensor's pose `late` seconds after time i, at the speed of the step from there (of the last, at the end)."""
-        if late == 0:
-            pose: Floats = self.path[i]
-            return pose
-        step = min(i, len(self.times) - 2)
-        return se2.compose(self.path[i], late / self.config.dt * se2.compose(se2.inverse(self.path[step]), self.path[step + 1]))
+    def _sweep(self, i: int) -> list[Part]:
+        """The parts of the scan at time i; a single one where the sensor does not sweep."""
+        config, step = self.config, min(i, len(self.times) - 2)
+        if config.sweep == 0:
+            return [Part(slice(0, config.beams), 0.0, self.path[i])]
+        edges = np.linspace(0, config.beams, SWEEP_PARTS + 1).round().astype(int)
+        edges = edges[np.append(True, np.diff(edges) > 0)]
+        late = config.sweep * ((edges[:-1] + edges[1:]) / (2 * config.beams) - 0.5)
+        onwards = se2.compose(
+            se2.inverse(self.path[step]), self.path[step + 1]
+        )  # at this speed; at that of the last step, at the end
+        poses = se2.compose(np.broadcast_to(self.path[i], (len(late), 3)), late[:, None] / config.dt * onwards)
+        return [Part(slice(a, b), *of) for (a, b), *of in zip(pairwise(edges), late.tolist(), poses, strict=True)]
 
     def _cast(self, outlines: Callable[[float], Shapes], body: int, i: int) -> Hits:
         """The hits of all beams on the outlines that a body has at a time, seconds."""
         bearings, reach = beam_bearings(self.config)[0], self.config.range_max / self.config.scale
-        parts = []
-        for beams, late in self._sweep():
-            shapes = outlines(self.times[i] + late).moved(se2.inverse(self._pose(i, late)))
+        found = []
+        for part in self.sweep:
+            shapes = outlines(self.times[i] + part.late).moved(part.from_world)
             shapes = in_view(shapes, reach, self.config.fov) if body == STATIC else shapes
-            parts.append(cast(shapes, bearings[beams], body, self.rng))
-        return Hits(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("ranges", "cosine", "body")))
+            found.append(cast(shapes, bearings[part.beams], body, self.rng))
+        return Hits(*(np.concatenate([getattr(of, name) for of in found]) for name in ("ranges", "cosine", "body")))
 
     def _settle(self, points: Floats, beam: Ints, body: Ints, i: int, movers: tuple[Mover, ...]) -> Floats:
         """(n, 2) the returns (n, 2) where their bodies would have been seen, had all beams been cast at time i."""
-        settled, now = points.copy(), self.times[i]
-        for beams, late in self._sweep() if self.config.sweep > 0 else []:
-            in_part = (beam >= beams.start) & (beam < beams.stop)
-            carried = [(STATIC, np.zeros(3)), (NO_BODY, np.zeros(3))]
-            carried += [(m.number, se2.compose(m.pose(now), se2.inverse(m.pose(now + late)))) for m in movers]
-            for number, carry in carried:
-                on = in_part & (body == number)
-                motion = se2.compose(se2.inverse(self.path[i]), se2.compose(carry, self._pose(i, late)))
+        settled, now, by_number = points.copy(), self.times[i], {m.number: m for m in movers}
+        for part in self.sweep if self.config.sweep > 0 else []:
+            in_part = (beam >= part.beams.start) & (beam < part.beams.stop)
+            for number in np.unique(body[in_part]).tolist():
+                mover, on = by_number.get(number), in_part & (body == number)
+                carry = se2.compose(mover.pose(now), se2.inverse(mover.pose(now + part.late))) if mover else np.zeros(3)
+                motion = se2.compose(se2.inverse(self.path[i]), se2.compose(carry, part.pose))
                 settled[on] = se2.apply(motion * np.array([1.0, self.config.scale, self.config.scale]), points[on])
         return settled
 

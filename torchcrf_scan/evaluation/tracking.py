@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from torchcrf_scan.evaluation.metrics import MOVER_MIN_POINTS
-from torchcrf_scan.scan import BACKGROUND, Floats, Ints
+from torchcrf_scan.scan import BACKGROUND, Bools, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +51,23 @@ def frame_of_points(body: Ints, track: Ints, least: int = MOVER_MIN_POINTS) -> T
     return TrackFrame(true[~is_small], found[~spared], similarity[~is_small][:, ~spared])
 
 
-def frame_of_positions(true: Ints, true_positions: Floats, found: Ints, positions: Floats, reach: float) -> TrackFrame:
+def frame_of_positions(
+    true: Ints, true_positions: Floats, asked: Bools, found: Ints, positions: Floats, reach: float
+) -> TrackFrame:
     """Objects are similar by distance: 1 at the same place, 0.5 at half of `reach`, 0 from there on.
 
+    True objects that are not asked for, such as hidden ones, need not be found; an estimated one that is nearest to such an
+    object, and no farther than half of `reach`, is not counted.
+
     Args:
-        true: (G,) numbers. true_positions: (G, 2) metres. found: (E,) numbers. positions: (E, 2). reach: metres.
+        true: (G,) numbers. true_positions: (G, 2) metres. asked: (G,) bool.
+        found: (E,) numbers. positions: (E, 2). reach: metres.
     """
     offset = true_positions.reshape(-1, 1, 2) - positions.reshape(1, -1, 2)
-    return TrackFrame(true, found, np.maximum(1 - np.hypot(offset[..., 0], offset[..., 1]) / reach, 0.0))
+    similarity = np.maximum(1 - np.hypot(offset[..., 0], offset[..., 1]) / reach, 0.0)  # (G, E)
+    best = similarity[asked].max(0, initial=0.0)
+    spared = similarity[~asked].max(0, initial=0.0) > np.maximum(best, 0.5)
+    return TrackFrame(true[asked], found[~spared], similarity[asked][:, ~spared])
 
 
 def track_scores(sequences: Sequence[Sequence[TrackFrame]]) -> dict[str, float]:

@@ -32,6 +32,8 @@ from torchcrf_scan.scan import ScanPair
 
 log = logging.getLogger(__name__)
 
+LINEAR = ("association_weights.", "clustering_weights.", "encoder.last.")  # parameters that log potentials are linear in
+
 
 @dataclass(frozen=True, slots=True)
 class Report:
@@ -74,6 +76,7 @@ class Learner:
         self.stopping = EarlyStopping(config.patience)
         self.best: dict[str, Tensor] | None = None
         self.mean = AveragedModel(self.model)
+        self.initial = {name: p.detach().clone() for name, p in self.model.named_parameters() if name.startswith(LINEAR)}
         self.step = 0
 
     def state_dict(self) -> dict[str, Any]:
@@ -83,6 +86,7 @@ class Learner:
             "model": self.model.state_dict(),
             "best": self.best,
             "mean": self.mean.state_dict(),
+            "initial": self.initial,
             "optimiser": self.optimiser.state_dict(),
             "schedule": self.schedule.state_dict(),
             "stopping": self.stopping.state_dict(),
@@ -91,7 +95,7 @@ class Learner:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores a state, of which it takes a copy, because the optimiser writes into it."""
         state = copy.deepcopy(state)
-        self.step, self.best = state["step"], state["best"]
+        self.step, self.best, self.initial = state["step"], state["best"], state["initial"]
         self.model.load_state_dict(state["model"])
         self.mean.load_state_dict(state["mean"])
         self.optimiser.load_state_dict(state["optimiser"])
@@ -158,12 +162,16 @@ class Learner:
         if self.stopping.look(self.step, loss):
             self.best = copy.deepcopy(self.model.state_dict())
 
-    def leave_best(self) -> None:
-        """Leaves the weights of the least validation loss in the model, else the mean of the last steps, if there is one."""
+    @torch.no_grad()
+    def finish(self) -> None:
+        """Leaves the final weights in the model: those of the least validation loss or the mean of the last steps, then blended."""
         if self.best is not None:
             self.model.load_state_dict(self.best)
         elif int(self.mean.n_averaged):
             self.model.load_state_dict(self.mean.module.state_dict())
+        for name, parameter in self.model.named_parameters():
+            if name in self.initial:
+                parameter.lerp_(self.initial[name].to(parameter), 1 - self.config.trained_share)
 
 
 def has_amp(config: GradientConfig, device: torch.device) -> bool:
@@ -198,7 +206,7 @@ def train_by_gradient(
     *,
     state: dict[str, Any] | None = None,
 ) -> Learner:
-    """Descends `config.first_order` from the model's weights or a checkpoint; leaves the best weights in the model, on the CPU.
+    """Descends `config.first_order` from the model's weights or a checkpoint; leaves the final weights in the model, on the CPU.
 
     Args:
         pairs: source of the samples that are not simulated. held_out: validation pairs; empty: the last weights are kept.
@@ -243,6 +251,6 @@ def train_by_gradient(
             look()
         if learner.step % gradient.checkpoint_every == 0 or is_last or learner.stopping.is_over:
             save()
-    learner.leave_best()
+    learner.finish()
     model.to("cpu").eval()
     return learner

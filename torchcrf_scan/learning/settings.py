@@ -135,6 +135,8 @@ class GradientConfig:
         warmup: steps of linear increase to the maximal learning rate, which then decays along a cosine.
         final_rate: final learning rate as a share of the maximum.
         average: share of the steps, the last ones, whose mean weights are kept where nothing is validated; 0: the last weights.
+        trained_share: weight of the trained log potentials in their mean with the initial ones; 1: the trained ones alone. Less
+            holds better on data unlike the training worlds (Wortsman et al., Robust fine-tuning, 2022).
         clip: norm to which gradients are clipped; 0: no clipping.
         amp: bfloat16 on GPUs that support it (torch.autocast); CPUs always use full precision.
         device: `auto` (a GPU if there is one), `cpu` or `cuda`.
@@ -160,6 +162,7 @@ class GradientConfig:
     warmup: CountOrNone = 10
     final_rate: Share = 0.05
     average: Share = 0.0
+    trained_share: Share = 1.0
     clip: Amount = 1.0
     amp: bool = False
     device: Annotated[str, OneOf("auto", "cpu", "cuda")] = "auto"

@@ -9,7 +9,7 @@ import numpy as np
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 
 WIDEST = 300.0  # bound on the differences of a node's and an edge's potentials, within which sums of exp stay in range
-SMALL = 1e-20  # if they are rescaled below this
+SMALL = 1e-20  # sums are rescaled below this and above its inverse
 LOWEST = -700.0  # exp of less is treated as 0
 T2, T3, T4, T5, T6, T7, T8, T9, T10, T11, T12 = (1 / math.factorial(k) for k in range(2, 13))  # Taylor series of exp
 
@@ -273,7 +273,7 @@ def _totals(log_unary: Array, log_pairwise: Array, without: Integers) -> Array:
     for i in range(1, N):
         for k in range(R):
             peak = _advance(sums[k], edges[i - 1], nodes[i], keep[k], after)
-            if 0 < peak < SMALL:
+            if 0 < peak < SMALL or peak > 1 / SMALL:
                 totals[k] += math.log(peak)
                 for s in range(S):
                     sums[k, s] /= peak

@@ -15,11 +15,13 @@ from torchcrf_scan.stream import extent as box
 from torchcrf_scan.stream import filter as kalman
 
 UNKNOWN_SPEED = 8.0  # m/s, standard deviation of a velocity that was not observed
+SLIDE = 1.0  # spacings, standard deviation of how far a shape may have slid along itself
 LONE_SPACING = 0.1  # metres, of an object of one point
-PARTIAL = 0.05  # share of an object's size by which the end of its visible part is uncertain
+PARTIAL = 0.1  # share of an object's size by which the end of its visible part is uncertain
 APART = 0.7, 4.0  # metres, and times the spacing of its points, between neighbours that are not of the same piece
 PERSISTENT = 3  # sightings in a row that must be larger than a box before it grows
-STEERED = 3.0  # standard deviations of the speed above which a heading is that of the velocity
+STEERED = 2.0  # standard deviations of the speed above which a heading is that of the velocity,
+ASTRAY = 0.5  # if that is known to so many radians
 DOUBT = 9.0  # squared standard deviations; a measurement farther off counts the less, the farther
 
 
@@ -39,15 +41,15 @@ class TrackerConfig:
         least_speed: m/s, below which a heading is kept.
     """
 
-    acceleration: Positive = 1.0
+    acceleration: Positive = 1.5
     range_noise: Positive = 0.02
     velocity_noise: Positive = 0.05
     gate: Positive = 20.0
-    sightings: Annotated[int, Within(1, 100)] = 3
-    among: Annotated[int, Within(1, 100)] = 5
+    sightings: Annotated[int, Within(1, 100)] = 2
+    among: Annotated[int, Within(1, 100)] = 4
     strong_points: Annotated[int, Within(1)] = 12
-    strong_speed: Positive = 8.0
-    lifetime: Amount = 1.0
+    strong_speed: Positive = 6.0
+    lifetime: Amount = 1.5
     loss: Positive = 2.0
     least_speed: Amount = 0.1
 
@@ -64,24 +66,37 @@ class Sighting:
     Attributes:
         points: (n, 2), n > 0, in the order of beams. velocity: (2,) over ground. covariance: (2, 2) of it; large where it was
             not observed.
-        noise: standard deviation of where its points end, metres.
+        turn: rad/s, of its rotation. noise: standard deviation of where its points end, metres.
     """
 
     points: Floats
     velocity: Floats
     covariance: Floats
+    turn: float
     noise: float
 
     @classmethod
-    def of(cls, points: Floats, velocity: Floats, covariance: Floats, config: TrackerConfig) -> Sighting:
-        """A velocity or covariance that is not finite or not positive counts as not observed."""
+    def of(cls, points: Floats, velocity: Floats, covariance: Floats, since: float, turn: float, config: TrackerConfig) -> Sighting:
+        """A velocity or covariance that is not finite or not positive counts as not observed, a turn that is not finite as none.
+
+        since: seconds over which the velocity was measured. A shape that slid by more than the spacing of its points in that time
+        would show other ends; this bounds the velocity's uncertainty where the shape itself tells nothing.
+        """
         spacing = float(np.median(np.hypot(*np.diff(points, axis=0).T))) if len(points) > 1 else LONE_SPACING
         noise = float(np.hypot(config.range_noise, min(spacing, 1.0) / 2))
+        turn = turn if np.isfinite(turn) else 0.0
         is_right = np.isfinite(velocity).all() and np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] >= 0
         if not is_right:
-            return cls(points, np.zeros(2), UNKNOWN_SPEED**2 * np.eye(2), noise)
-        floor = config.velocity_noise**2 * np.eye(2)
-        return cls(points, velocity, (covariance + covariance.T) / 2 + floor, noise)
+            return cls(points, np.zeros(2), UNKNOWN_SPEED**2 * np.eye(2), turn, noise)
+        most = SLIDE * np.hypot(spacing, config.range_noise) / since if since > 0 else np.inf
+        values, axes = np.linalg.eigh(covariance + config.velocity_noise**2 * np.eye(2))
+        bounded = axes @ np.diag(1 / (1 / values + 1 / most**2)) @ axes.T
+        return cls(points, velocity, bounded, turn, noise)
+
+    def velocity_at(self, place: Floats) -> Floats:
+        """(2,) the velocity of the object where its centre is, which differs from that of its visible points as it turns."""
+        x, y = place - self.points.mean(0)
+        return self.velocity + self.turn * np.array([-y, x])
 
     def pieces(self) -> list[Sighting]:
         """Its pieces that lie apart, the one of most points first: what was not one thing, or what hides in part."""
@@ -178,9 +193,10 @@ class Track:
         still = np.eye(4)[2:]
         expected = axes @ self.covariance[:2, :2] @ axes.T
         strayed = doubt(view.shift[:, None], (np.diag(expected) + noise**2)[:, None, None])
-        turned = doubt(sighting.velocity - self.velocity, self.covariance[2:, 2:] + sighting.covariance)
+        change = sighting.velocity_at(self.centre) - self.velocity
+        turned = doubt(change, self.covariance[2:, 2:] + sighting.covariance)
         rows = [*np.flatnonzero(view.is_seen), 2, 3]
-        innovation = np.concatenate([view.shift, sighting.velocity - self.velocity])
+        innovation = np.concatenate([view.shift, change])
         R = np.zeros((4, 4))
         R[:2, :2], R[2:, 2:] = np.diag(noise**2 * strayed), sighting.covariance * turned
         H = np.concatenate([ahead, still])
@@ -202,21 +218,29 @@ class Track:
 
     def _turned(self, config: TrackerConfig) -> Track:
         """With the heading of the velocity, if it is certain; the first time, the box is fitted anew."""
-        speed = float(np.hypot(*self.velocity))
-        if speed < max(config.least_speed, STEERED * _deviation(self.covariance[2:, 2:])):
+        if not self._has_course(config):
             return self
         turned = replace(self, heading=float(np.arctan2(self.velocity[1], self.velocity[0])))
         return turned if self.is_steered else turned._boxed(config)
 
     def _boxed(self, config: TrackerConfig) -> Track:
         """With the box of its points alone, along the velocity if that is certain."""
-        speed = float(np.hypot(*self.velocity))
-        is_steered = speed >= max(config.least_speed, STEERED * _deviation(self.covariance[2:, 2:]))
+        is_steered = self._has_course(config)
         heading = float(np.arctan2(self.velocity[1], self.velocity[0])) if is_steered else self.heading
         seen = box.cover(self.points, self.centre, heading)
         centre = self.centre + se2.rotate(np.asarray(heading), seen.middle)
         state = np.concatenate([centre, self.velocity])
         return replace(self, state=state, heading=heading, extent=seen.size, is_steered=is_steered, seen_from=centre)
+
+    def _has_course(self, config: TrackerConfig) -> bool:
+        """Whether the direction of the velocity is certain."""
+        speed = float(np.hypot(*self.velocity))
+        if speed <= config.least_speed:
+            return False
+        ahead = self.velocity / speed
+        aside = np.array([-ahead[1], ahead[0]])
+        along, across = (float(np.sqrt(of @ self.covariance[2:, 2:] @ of)) for of in (ahead, aside))
+        return speed > STEERED * along and across < ASTRAY * speed
 
     def to_object(self, points: int) -> MovingObject:
         """As the result of a scan in which it has that many points."""

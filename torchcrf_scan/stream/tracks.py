@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from torchcrf_scan.result import MovingObject
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints
-from torchcrf_scan.stream.assignment import Comparison, assign
+from torchcrf_scan.stream.assignment import Comparison, assign, twins
 from torchcrf_scan.stream.track import Sighting, Track, TrackerConfig
 
 
@@ -79,6 +80,8 @@ class Tracker:
         velocities: Floats,
         covariances: Floats,
         sensor: Floats | None = None,
+        since: float = 0.0,
+        turns: Floats | None = None,
     ) -> tuple[Ints, tuple[MovingObject, ...]]:
         """Takes a scan.
 
@@ -87,6 +90,8 @@ class Tracker:
             points: (N, 2) in the world. cluster: (N,) 0 background, k >= 1 mover k, -1 outlier.
             velocities: (K, 2) of the movers over ground, m/s. covariances: (K, 2, 2). NaN: not observed.
             sensor: (2,) its position in the world, which tells the faces it sees; None: not known.
+            since: seconds over which the velocities were measured; 0: not known.
+            turns: (K,) rad/s, at which the movers rotate; the velocities are those of the middle of their points. NaN: not known.
 
         Returns:
             (K,) the number of each mover's track, 0 for a mover without points, and the confirmed objects by number.
@@ -95,8 +100,23 @@ class Tracker:
             ValueError: a stamp or points that are not finite, shapes that do not fit each other, clusters beyond K.
         """
         points, cluster, velocities, covariances = _checked(stamp, points, cluster, velocities, covariances)
+        rates = np.zeros(len(velocities)) if turns is None else np.asarray(turns, dtype=np.float64)
+        if rates.shape != (len(velocities),):
+            raise ValueError(f"turns: expected ({len(velocities)},), got {rates.shape}")
         labels = [k for k in range(1, len(velocities) + 1) if (cluster == k).any()]
-        sightings = [Sighting.of(points[cluster == k], velocities[k - 1], covariances[k - 1], self.config) for k in labels]
+        sightings = [
+            Sighting.of(points[cluster == k], velocities[k - 1], covariances[k - 1], since, float(rates[k - 1]), self.config)
+            for k in labels
+        ]
+        numbers, objects = self._taken(stamp, sightings, sensor)
+        of_cluster = np.zeros(len(velocities), dtype=np.int64)
+        of_cluster[[k - 1 for k in labels]] = numbers
+        return of_cluster, objects
+
+    def _taken(
+        self, stamp: float, sightings: Sequence[Sighting], sensor: Floats | None
+    ) -> tuple[list[int], tuple[MovingObject, ...]]:
+        """Follows the sightings of a scan; returns the track number of each, and the confirmed objects."""
         tracks = self._at(stamp)
         found, numbers = self._matched(tracks, sightings)
         after = [
@@ -104,13 +124,15 @@ class Tracker:
             for track in tracks
         ]
         after = [track for track in after if track.number in found or not track.is_over(self.config)]
-        born = [Track.born_of(n, stamp, of, self.config) for n, of in zip(numbers, sightings, strict=True) if n not in found]
-        self._tracks, self._stamp = [*after, *born], stamp
-        seen = {number: len(of.points) for number, of in found.items()} | {of.number: len(of.points) for of in born}
-        objects = tuple(of.to_object(seen.get(of.number, 0)) for of in self._tracks if of.is_confirmed)
-        of_cluster = np.zeros(len(velocities), dtype=np.int64)
-        of_cluster[[k - 1 for k in labels]] = numbers
-        return of_cluster, objects
+        first = {n: of.pieces()[0] for n, of in zip(numbers, sightings, strict=True) if n not in found}
+        born = [Track.born_of(n, stamp, of, self.config) for n, of in first.items()]
+        same = twins([*after, *born])
+        self._tracks, self._stamp = [of for of in (*after, *born) if of.number not in same], stamp
+        seen: Counter[int] = Counter()
+        for number, of in (found | first).items():
+            seen[same.get(number, number)] += len(of.points)
+        objects = tuple(of.to_object(seen[of.number]) for of in self._tracks if of.is_confirmed)
+        return [same.get(number, number) for number in numbers], objects
 
     def _at(self, stamp: float) -> list[Track]:
         """The tracks predicted to a time, without those that it ends."""
