@@ -207,7 +207,8 @@ class ScanStream:
         self._history.clear()
         self._objects.begin(view)
         self._history.add(view, self.config.lag)
-        self._keyframe, self._pose, self._covariance, self._has_velocity = view, view.pose, LEAST, False
+        self._keyframe, self._pose, self._covariance = view, view.pose, LEAST
+        self._has_velocity, self._twist = False, np.zeros(3)
         return self._result(view.scan, stamp, nothing_moves(view.scan, BACKGROUND), unknown(), "ok", "")
 
     def _not_placed(self, scan: Scan, stamp: float, predicted: Floats, backed: Backed) -> ScanResult:
