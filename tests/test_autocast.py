@@ -16,7 +16,9 @@ def batch() -> ScanPairBatch:
 
 @pytest.fixture(scope="module")
 def model() -> JointScanCRF:
-    return JointScanCRF.from_pretrained(motion_weights="soft", temperature=1.0, stop_early=False, iterations=2, backend="eager")
+    return JointScanCRF.from_pretrained(
+        "simulated", motion_weights="soft", temperature=1.0, stop_early=False, iterations=2, backend="eager"
+    )
 
 
 def test_the_start_is_the_same(model: JointScanCRF, batch: ScanPairBatch) -> None:

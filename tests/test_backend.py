@@ -39,12 +39,12 @@ def batch(pairs: list[ScanPair]) -> ScanPairBatch:
 
 @pytest.fixture(scope="module")
 def compiled() -> JointScanCRF:
-    return JointScanCRF.from_pretrained(backend="compiled").double()
+    return JointScanCRF.from_pretrained("simulated", backend="compiled").double()
 
 
 @pytest.fixture(scope="module")
 def eager() -> JointScanCRF:
-    return JointScanCRF.from_pretrained(backend="eager").double()
+    return JointScanCRF.from_pretrained("simulated", backend="eager").double()
 
 
 @pytest.fixture
@@ -106,7 +106,7 @@ def test_both_start_from_the_same_search_and_go_on_from_a_given_start(
 
 
 def test_gradients_are_asked_of_tensors(batch: ScanPairBatch) -> None:
-    model = JointScanCRF.from_pretrained(motion_weights="soft", iterations=1).double()
+    model = JointScanCRF.from_pretrained("simulated", motion_weights="soft", iterations=1).double()
     one = batch.select(torch.tensor([0]))
     model(one).log_cluster[one.source_mask].exp().sum().backward()
     assert model.clustering_weights["sequence"].grad is not None

@@ -26,7 +26,7 @@ OF_CLUSTERING = {"clustering weights", "moving"}
 def scene() -> tuple[ScanPairBatch, Start]:
     """Two coarse pairs of a street and their start."""
     batch = ScanPairBatch.collate(simulate_pairs(SimulatorConfig(beams=41), 2, 1, 3), torch.float64)
-    return batch, JointScanCRF.from_pretrained(backend="eager").double().initialise(batch)
+    return batch, JointScanCRF.from_pretrained("simulated", backend="eager").double().initialise(batch)
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Layer:
     def of(cls, **inference: object) -> "Layer":
         batch, start = scene()
         settings = {"motion_weights": "soft", "temperature": 1.0, "stop_early": False, "iterations": 2} | inference
-        model = JointScanCRF.from_pretrained(features={"embedding": "dot"}, backend="eager", **settings).double()
+        model = JointScanCRF.from_pretrained("simulated", features={"embedding": "dot"}, backend="eager", **settings).double()
         generator = torch.Generator().manual_seed(1)
         both = [torch.randn(*of.shape[:2], 4, generator=generator, dtype=of.dtype) for of in (batch.source, batch.target)]
         none = torch.zeros_like(batch.source[..., 0])
@@ -130,7 +130,7 @@ def test_max_marginals_have_finite_gradients_and_soft_motions_too() -> None:
 
 def test_flooding_has_no_gradient() -> None:
     batch, start = scene()
-    model = JointScanCRF.from_pretrained(schedule="flooding", iterations=1, backend="eager").double()
+    model = JointScanCRF.from_pretrained("simulated", schedule="flooding", iterations=1, backend="eager").double()
     prediction = model(batch, start)
     for name in ("motions", "log_association", "log_cluster", "association_confidence", "cluster_confidence"):
         assert not getattr(prediction, name).requires_grad, name
@@ -158,7 +158,7 @@ def test_beliefs_sum_to_one_so_their_sum_has_no_gradient() -> None:
 def test_padding_is_uniform() -> None:
     pairs = [*simulate_pairs(SimulatorConfig(beams=41), 1, 1, 3), *simulate_pairs(SimulatorConfig(beams=31), 1, 1, 3)]
     batch = ScanPairBatch.collate(pairs, torch.float64)
-    prediction = JointScanCRF.from_pretrained(backend="eager", iterations=1).double()(batch)
+    prediction = JointScanCRF.from_pretrained("simulated", backend="eager", iterations=1).double()(batch)
     assert bool((~batch.source_mask).any())
     for log_beliefs in (prediction.log_association[~batch.source_mask], prediction.log_cluster[~batch.source_mask]):
         assert_close(log_beliefs.detach().exp(), torch.full_like(log_beliefs, 1 / log_beliefs.shape[-1]))
@@ -166,7 +166,7 @@ def test_padding_is_uniform() -> None:
 
 def test_matching_by_beam_is_arrays_without_gradient() -> None:
     (pair,) = simulate_pairs(SimulatorConfig(beams=41), 1, 1, 3)
-    answer = JointScanCRF.from_pretrained(backend="eager", iterations=1).match(pair.source, pair.target, pair.dt)
+    answer = JointScanCRF.from_pretrained("simulated", backend="eager", iterations=1).match(pair.source, pair.target, pair.dt)
     for field in fields(PairPrediction):
         assert isinstance(getattr(answer, field.name), np.ndarray | bool), field.name
 

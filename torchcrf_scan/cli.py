@@ -14,9 +14,11 @@ from jsonargparse import ActionYesNo, ArgumentParser
 
 from torchcrf_scan import __version__
 from torchcrf_scan.commands.bench import bench
+from torchcrf_scan.commands.drives import drives
 from torchcrf_scan.commands.evaluate import evaluate
 from torchcrf_scan.commands.experiment import experiment, experiment_parser
 from torchcrf_scan.commands.failures import one_line
+from torchcrf_scan.commands.listen import listen
 from torchcrf_scan.commands.match import match
 from torchcrf_scan.commands.odometry import odometry
 from torchcrf_scan.commands.play import play
@@ -36,7 +38,9 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
     "evaluate": evaluate,
     "experiment": experiment,
     "plot": plot,
+    "listen": listen,
     "bench": bench,
+    "drives": drives,
     "prepare": prepare,
 }
 

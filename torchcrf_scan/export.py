@@ -186,13 +186,13 @@ def count_below(sorted_sequence: Tensor, values: Tensor) -> Tensor:
     return (sorted_sequence[:, None] < values[..., None]).sum(-1)
 
 
-def middle_of_known(values: Tensor, dim: int) -> torch.return_types.nanmedian:
+def middle_of_known(values: Tensor, dim: int, *, keepdim: bool = False) -> torch.return_types.nanmedian:
     """`torch.nanmedian`: the lower of the two middle values, and its index; NaN if all values are NaN."""
     ordered, index = values.masked_fill(values.isnan(), torch.inf).sort(dim)
     known = (~values.isnan()).sum(dim, keepdim=True)
     place = (known - 1).clamp(min=0) // 2
-    middle = torch.where(known > 0, ordered.gather(dim, place), torch.nan)
-    return torch.return_types.nanmedian((middle.squeeze(dim), index.gather(dim, place).squeeze(dim)))
+    middle, index = torch.where(known > 0, ordered.gather(dim, place), torch.nan), index.gather(dim, place)
+    return torch.return_types.nanmedian((middle, index) if keepdim else (middle.squeeze(dim), index.squeeze(dim)))
 
 
 def eliminate(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:

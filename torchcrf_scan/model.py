@@ -35,6 +35,7 @@ from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.pretrained import PRETRAINED, find_weights, load_state, read_config, write_model
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 from torchcrf_scan.search.accept import score_of
+from torchcrf_scan.search.expected import Expected
 from torchcrf_scan.search.pairs import initialise, start_pairs
 from torchcrf_scan.search.score import HypothesisScore
 from torchcrf_scan.variants import sweep
@@ -296,16 +297,23 @@ class JointScanCRF(nn.Module):
 
     @torch.no_grad()
     def match(
-        self, source: Scan, target: Scan, dt: float = 0.1, *, initial_motion: Sequence[float] | None = None
+        self,
+        source: Scan,
+        target: Scan,
+        dt: float = 0.1,
+        *,
+        initial_motion: Sequence[float] | None = None,
+        expected: Expected | None = None,
     ) -> PairPrediction:
         """Association, cluster and motions of one pair, by beam of `source`.
 
         Args:
             initial_motion: a guess (theta, tx, ty) of the background's motion, e.g. from odometry; used as one more initial
                 hypothesis, never taken unchecked.
+            expected: what is known of the movers from before; likewise. Used where the loops answer, on a CPU.
         """
         pair = ScanPair(source, target, dt, initial_motion=None if initial_motion is None else np.asarray(initial_motion))
-        return self.match_pairs([pair])[0]
+        return self._match([pair], expected)[0]
 
     @torch.no_grad()
     def match_pairs(self, pairs: Sequence[ScanPair], batch_size: int = 16) -> list[PairPrediction]:
@@ -315,18 +323,23 @@ class JointScanCRF(nn.Module):
             found += self._match(pairs[begin : begin + batch_size])
         return found
 
-    def _match(self, pairs: Sequence[ScanPair]) -> list[PairPrediction]:
-        """Predictions of one batch of pairs: in arrays throughout where the loops compute the rounds, else in padded tensors."""
+    def _match(self, pairs: Sequence[ScanPair], expected: Expected | None = None) -> list[PairPrediction]:
+        """Predictions of one batch of pairs: in arrays throughout where the loops compute the rounds, else in padded tensors.
+
+        expected: of a single pair.
+        """
         reference = self.association_weights["sequence"]
         has_embeddings = self.config.encoder.embedding > 0
         if not (STARTS[self.config.start].in_loops and can_decode(self.config, reference.device, has_embeddings=has_embeddings)):
             prediction = self(ScanPairBatch.collate(pairs, reference.dtype).without_truth().to(reference.device))
             return [prediction.pair(b, pair) for b, pair in enumerate(pairs)]
         scans = [pair_of_scans(pair, reference.dtype) for pair in pairs]
-        starts = start_pairs(scans, score_of(self.hypothesis_score), self.config.motions)
+        starts = start_pairs(scans, score_of(self.hypothesis_score), self.config.motions, expected)
         extras = extras_of(
             [len(pair.source) for pair in scans], None if self.encoder is None else self.encoder.of_pairs(scans, starts)
         )
+        if expected is not None:
+            extras = [extras[0].plus_moving(expected.log_moving)]
         answers = decode_pairs(scans, starts, extras, fitted_of(self.fitted), settings_of(self.config))
         return [by_beam(answer, pair) for answer, pair in zip(answers, pairs, strict=True)]
 

@@ -32,7 +32,7 @@ def pairs_of(world: str) -> list[ScanPair]:
 @cache
 def scene(world: str) -> tuple[ScanPairBatch, Start]:
     batch = ScanPairBatch.collate(pairs_of(world), torch.float64).without_truth()
-    return batch, JointScanCRF.from_pretrained().double().initialise(batch)
+    return batch, JointScanCRF.from_pretrained("simulated").double().initialise(batch)
 
 
 def finite(values: Tensor) -> Tensor:
@@ -52,7 +52,7 @@ def slopes(
 ) -> tuple[Prediction, dict[str, Tensor], JointScanCRF]:
     """The answer to a world's pairs, and the gradient of its loss by every input with one."""
     batch, start = scene(world)
-    model = JointScanCRF.from_pretrained(backend=backend, iterations=3, **settings).double()
+    model = JointScanCRF.from_pretrained("simulated", backend=backend, iterations=3, **settings).double()
     if is_left_out:
         torch.nn.init.zeros_(model.clustering_weights["hidden"])
     extra = [0.1 * normal(*batch.source_mask.shape, seed=seed) for seed in (7, 8)]
@@ -91,7 +91,7 @@ def test_a_weight_of_zero_has_a_gradient() -> None:
 
 def test_gradients_are_those_of_finite_differences() -> None:
     batch, start = scene("street")
-    model = JointScanCRF.from_pretrained(motion_weights="soft", stop_early=False, iterations=2).double()
+    model = JointScanCRF.from_pretrained("simulated", motion_weights="soft", stop_early=False, iterations=2).double()
     leaves = [*model.association_weights.values(), *model.clustering_weights.values()]
     found = torch.autograd.grad(loss_of(model(batch, start)), leaves)
     step = 1e-6
@@ -111,7 +111,7 @@ def test_gradients_are_those_of_finite_differences() -> None:
 
 def test_a_batch_is_the_loop_over_its_pairs() -> None:
     pairs = [pair for world in ("street", "indoor") for pair in pairs_of(world)]
-    model = JointScanCRF.from_pretrained(motion_weights="soft", iterations=2).double()
+    model = JointScanCRF.from_pretrained("simulated", motion_weights="soft", iterations=2).double()
 
     def gradient(some: list[ScanPair]) -> Tensor:
         batch = ScanPairBatch.collate(some, torch.float64).without_truth()
@@ -126,12 +126,12 @@ def test_a_batch_is_the_loop_over_its_pairs() -> None:
 
 def test_what_the_loops_do_not_cover_goes_to_the_tensors() -> None:
     batch, start = scene("street")
-    model = JointScanCRF.from_pretrained(motion_weights="soft", iterations=1).double()
+    model = JointScanCRF.from_pretrained("simulated", motion_weights="soft", iterations=1).double()
     points = batch.source.clone().requires_grad_()
     model(replace(batch, source=points), start).motions.sum().backward()
     assert points.grad is not None
     assert points.grad.isfinite().all()
-    strict = JointScanCRF.from_pretrained(iterations=1, backend="compiled").double()
+    strict = JointScanCRF.from_pretrained("simulated", iterations=1, backend="compiled").double()
     with pytest.raises(ValueError, match=r"no gradient to be asked for by batch\.source, start"):
         strict(replace(batch, source=points), replace(start, motions=start.motions.clone().requires_grad_()))
     with pytest.raises(ValueError, match="no call inside a transform"):
@@ -142,7 +142,7 @@ def test_what_the_loops_do_not_cover_goes_to_the_tensors() -> None:
 
 def test_a_gradient_of_a_gradient_is_refused() -> None:
     batch, start = scene("street")
-    model = JointScanCRF.from_pretrained(motion_weights="soft", iterations=1).double()
+    model = JointScanCRF.from_pretrained("simulated", motion_weights="soft", iterations=1).double()
     weight = model.clustering_weights["sequence"]
     (slope,) = torch.autograd.grad(loss_of(model(batch, start)), weight, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
@@ -151,7 +151,7 @@ def test_a_gradient_of_a_gradient_is_refused() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_no_gradient_of_random_batches_is_not_a_number(dtype: torch.dtype) -> None:
-    model = JointScanCRF.from_pretrained(motion_weights="soft", stop_early=False, iterations=2).to(dtype)
+    model = JointScanCRF.from_pretrained("simulated", motion_weights="soft", stop_early=False, iterations=2).to(dtype)
     for seed in range(50):
         names = sorted(WORLDS)
         world = WORLDS[names[seed % len(names)]]
@@ -185,9 +185,9 @@ def test_the_way_back_through_merged_clusters() -> None:
 
 def test_states_of_several_rounds() -> None:
     batch, start = scene("street")
-    model = JointScanCRF.from_pretrained(motion_weights="soft", stop_early=False, iterations=3).double()
+    model = JointScanCRF.from_pretrained("simulated", motion_weights="soft", stop_early=False, iterations=3).double()
     found = unroll_in_loops(batch, start, model.fitted, model.config, last=2)
-    shorter = JointScanCRF.from_pretrained(motion_weights="soft", stop_early=False, iterations=2).double()
+    shorter = JointScanCRF.from_pretrained("simulated", motion_weights="soft", stop_early=False, iterations=2).double()
     assert_close(found.rounds[0].state.motions.value.detach(), shorter(batch, start).scaled(found.factor).motions.detach())
     assert_close(found.rounds[1].state.log_cluster.detach(), model(batch, start).log_cluster.detach())
     assert found.rounds[1].iterations.tolist() == [3, 3, 0]
@@ -197,7 +197,7 @@ def test_simulated_pairs_of_full_scans() -> None:
     batch = ScanPairBatch.collate(simulate_pairs(SimulatorConfig(beams=181), 2, 1, 0), torch.float64).without_truth()
     found = []
     for backend in ("eager", "compiled"):
-        model = JointScanCRF.from_pretrained(motion_weights="soft", iterations=2, backend=backend).double()
-        loss_of(model(batch, JointScanCRF.from_pretrained().double().initialise(batch))).backward()
+        model = JointScanCRF.from_pretrained("simulated", motion_weights="soft", iterations=2, backend=backend).double()
+        loss_of(model(batch, JointScanCRF.from_pretrained("simulated").double().initialise(batch))).backward()
         found.append({name: of.grad for name, of in model.named_parameters() if of.grad is not None})
     assert_alike(found[1], found[0])

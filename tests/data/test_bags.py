@@ -224,6 +224,8 @@ def test_folders_with_wrong_metadata(tmp_path: Path) -> None:
     next(file for file in path.iterdir() if file.suffix == ".db3").rename(path / "other.db3")
     with pytest.raises(ValueError, match=r"expected the file that metadata\.yaml lists"):
         next(read_scans(path))
+    (path / "metadata.yaml").unlink()
+    assert len(list(read_scans(path))) == 2  # a recorder that was killed leaves none
     for text in ("[", "a: b", ""):
         (path / "metadata.yaml").write_text(text)
         with pytest.raises(ValueError, match=r"metadata\.yaml: expected a list of files, got"):

@@ -100,6 +100,7 @@ def test_bearings(count: int, last: float) -> None:
         (["laser_front_laser_resolution 1"], -90, 45),  # 4 degrees in all: the line is another laser's
         (["laser_rear_laser_fov 240"], -90, 45),
         (["laser_front_laser_fov none"], -90, 45),
+        (["simulator_front_laser_count_fov 10"], -90, 45),
     ],
 )
 def test_params_tell_the_field_of_view(tmp_path: Path, params: list[str], first: float, step: float) -> None:
@@ -123,6 +124,12 @@ def test_newer_lines_have_a_geometry_of_their_own(tmp_path: Path, kind: str, pos
     else:
         assert first.pose is None
         assert first.odometry.tolist() == [0.25, 3, 4]
+
+
+def test_a_param_tells_where_the_laser_sits(tmp_path: Path) -> None:
+    params = ["robot_frontlaser_angular_offset 1", "robot_frontlaser_offset 0.25", "robot_rearlaser_offset 9"]
+    file = save(tmp_path, *(f"PARAM {text} 0 host 0" for text in params), line([1.0], (0, 0, math.pi / 2), 0))
+    np.testing.assert_allclose(next(read_carmen(file)).odometry, [math.pi / 2, 1, 0.25])
 
 
 def test_a_step_of_few_digits_is_made_exact_by_the_view(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ def name_of(path: Path) -> str | None:
     [
         (CARMEN.encode(), "CARMEN log"),
         (gzip.compress(CARMEN.encode()), "CARMEN log"),
-        (b"PARAM a b\r\n\tODOM \xe4\n", "CARMEN log"),
+        (b"PARAM a b\r\n\tODOM \xe4 \x93\n", "CARMEN log"),
         (b"stamp,0.0,0.1\n", "CSV of ranges"),
         (gzip.compress(b'\xef\xbb\xbf"stamp",0.0,0.1\n'), "CSV of ranges"),
         (b"#ROSBAG V2.0\n\0\0", "ROS 1 bag"),

@@ -12,7 +12,7 @@ from torchcrf_scan.data import annotate, laser, simulate, world
 from torchcrf_scan.data.laser import cast
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.world import Mover, Shapes
-from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.data.worlds import NAMED_WORLDS, SimulatorConfig
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import ScanPair
 
@@ -71,6 +71,21 @@ def test_same_seed_same_bytes():
         assert [x.tobytes() for x in arrays(a)] == [x.tobytes() for x in arrays(b)]
         assert (a.name, a.sequence) == (b.name, b.sequence)
     assert first[0].source.ranges.tobytes() != other[0].source.ranges.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "points", "moving", "metres"),
+    [
+        ("street", [292, 301, 304, 341, 354, 352], [21, 26, 26, 4, 6, 6], 56963.652007),
+        ("model_cars_dominant", [230, 227, 239, 239, 225, 217], [12, 18, 23, 99, 96, 96], 2767.128094),
+        ("crowd_768", [752, 749, 751, 748, 755, 746], [64, 57, 68, 3, 3, 35], 22749.813801),
+    ],
+)
+def test_data_sets_stay_what_they_were(name: str, points: list[int], moving: list[int], metres: float) -> None:
+    pairs = simulate_pairs(NAMED_WORLDS[name], 6, 2, 5)
+    assert [len(pair.source) for pair in pairs] == points
+    assert [np.count_nonzero(pair.annotation.cluster > 0) for pair in pairs] == moving
+    assert sum(pair.source.ranges.sum() for pair in pairs) == pytest.approx(metres, abs=1e-3)
 
 
 def test_names_and_sensor_limits():

@@ -36,7 +36,7 @@ def batch(pairs: list[ScanPair]) -> ScanPairBatch:
 
 def with_encoder(encoder: EncoderConfig = SMALL, *, embedding: str = "none", backend: str = "auto") -> JointScanCRF:
     """The shipped model with an encoder that has learned nothing."""
-    shipped = JointScanCRF.from_pretrained(backend=backend)
+    shipped = JointScanCRF.from_pretrained("simulated", backend=backend)
     torch.manual_seed(0)
     model = JointScanCRF(replace(shipped.config, encoder=encoder, features=replace(shipped.config.features, embedding=embedding)))
     load_weights(model, shipped)
@@ -85,7 +85,7 @@ def test_padding_is_invisible() -> None:
 @torch.no_grad()
 @pytest.mark.parametrize("backend", ["eager", "auto"])
 def test_before_it_has_learned_it_says_nothing(batch: ScanPairBatch, backend: str) -> None:
-    expected, found = JointScanCRF.from_pretrained(backend=backend)(batch), with_encoder(backend=backend)(batch)
+    expected, found = JointScanCRF.from_pretrained("simulated", backend=backend)(batch), with_encoder(backend=backend)(batch)
     assert torch.equal(found.association, expected.association)
     assert torch.equal(found.cluster, expected.cluster)
     assert_close(found.motions, expected.motions)
@@ -93,7 +93,7 @@ def test_before_it_has_learned_it_says_nothing(batch: ScanPairBatch, backend: st
 
 @torch.no_grad()
 def test_what_it_says_is_what_could_have_been_given(batch: ScanPairBatch) -> None:
-    model, plain = loud(with_encoder(backend="eager")), JointScanCRF.from_pretrained(backend="eager")
+    model, plain = loud(with_encoder(backend="eager")), JointScanCRF.from_pretrained("simulated", backend="eager")
     start = plain.initialise(batch)
     assert model.encoder is not None
     extra = model.encoder(batch, start, "eager").extra
@@ -184,7 +184,7 @@ def test_it_learns_with_the_weights(pairs: list[ScanPair]) -> None:
 
 @torch.no_grad()
 def test_the_shipped_one_tells_more_outliers(batch: ScanPairBatch, pairs: list[ScanPair]) -> None:
-    encoded, plain = JointScanCRF.from_pretrained("encoder"), JointScanCRF.from_pretrained()
+    encoded, plain = JointScanCRF.from_pretrained("encoder"), JointScanCRF.from_pretrained("simulated")
     assert encoded.encoder is not None
     assert plain.encoder is None
     assert batch.truth is not None

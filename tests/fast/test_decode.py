@@ -39,11 +39,11 @@ CONFIGS: dict[str, dict[str, Any]] = {
 
 @cache
 def layer() -> JointScanCRF:
-    return JointScanCRF.from_pretrained(backend="eager").double().requires_grad_(False)
+    return JointScanCRF.from_pretrained("simulated", backend="eager").double().requires_grad_(False)
 
 
 def with_config(**inference: Any) -> JointScanCRF:
-    model = JointScanCRF.from_pretrained(backend="eager", **inference)
+    model = JointScanCRF.from_pretrained("simulated", backend="eager", **inference)
     return model.double().requires_grad_(False)
 
 
@@ -144,7 +144,7 @@ def test_metres_and_starts_without_odds_are_decoded_alike() -> None:
 @pytest.mark.parametrize(("reach", "weight"), [("soft", 0.0), ("soft", 0.3), ("soft", 3.0), ("off", 0.0)])
 @pytest.mark.parametrize("seed", [0, 2])
 def test_reaches_are_decoded_alike(reach: str, weight: float, seed: int) -> None:
-    model, batch = JointScanCRF.from_pretrained(backend="eager", features={"reach": reach}).double(), simulated(seed)
+    model, batch = JointScanCRF.from_pretrained("simulated", backend="eager", features={"reach": reach}).double(), simulated(seed)
     model.requires_grad_(False)
     if reach == "soft":
         assert model.clustering_weights["reach"] == 0

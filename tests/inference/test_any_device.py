@@ -66,7 +66,7 @@ def test_rounds_mix_no_devices_and_read_no_value(settings: dict[str, Any]) -> No
 
 
 def test_the_pseudo_likelihood_mixes_no_devices_and_reads_no_value() -> None:
-    batch, module = annotated(), Likelihood(JointScanCRF.from_pretrained())
+    batch, module = annotated(), Likelihood(JointScanCRF.from_pretrained("simulated"))
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         state = elsewhere(mode, module)
         found = torch.func.functional_call(module, state, (moved(mode, batch),))

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchcrf_scan.config import EncoderConfig
 from torchcrf_scan.learning.checkpoint import NAME
-from torchcrf_scan.learning.gradient import Learner, has_amp, portions_from
+from torchcrf_scan.learning.gradient import LINEAR, Learner, has_amp, portions_from
 from torchcrf_scan.learning.objectives import pseudo_likelihood
 from torchcrf_scan.learning.portions import Portion, as_portion
 from torchcrf_scan.learning.ranks import ALONE, Ranks
@@ -128,6 +128,28 @@ def test_without_validation_the_last_weights_are_kept(tmp_path: Path) -> None:
     assert learner.best is None
     assert watcher.validations == []
     assert (tmp_path / NAME).exists()
+
+
+def weights_after(steps: int, path: Path, **settings: Any) -> dict[str, Tensor]:
+    learner, _ = small_run.run(path, small_run.small_config(steps=steps, validation=0.0, warmup=0, final_rate=1.0, **settings))
+    return {name: p.detach().clone() for name, p in learner.model.named_parameters()}
+
+
+def test_the_mean_of_the_last_steps_is_kept(tmp_path: Path) -> None:
+    second, third = (weights_after(steps, tmp_path / str(steps)) for steps in (2, 3))
+    found = weights_after(3, tmp_path / "mean", average=0.6)  # the last two of three
+    for name, values in found.items():
+        torch.testing.assert_close(values, (second[name] + third[name]) / 2, rtol=1e-6, atol=1e-9)
+
+
+def test_a_share_of_the_initial_weights_is_kept(tmp_path: Path) -> None:
+    trained, none = (weights_after(2, tmp_path / str(share), trained_share=share) for share in (1.0, 0.0))
+    found = weights_after(2, tmp_path / "blend", trained_share=0.7)
+    linear = [name for name in found if name.startswith(LINEAR)]
+    assert len(linear) > 30
+    for name in linear:
+        torch.testing.assert_close(found[name], 0.7 * trained[name] + 0.3 * none[name], rtol=1e-6, atol=1e-9)
+    assert any(not torch.equal(trained[name], none[name]) for name in linear)
 
 
 def test_a_disk_that_fills_up_does_not_stop_the_training(

@@ -32,7 +32,7 @@ TASKS = {
     f"step of an encoder on {STEP} fresh pairs, a pair": "step",
 }
 WORLDS = "street,fast_street,model_cars,model_cars_dominant,indoor,street_dominant,still_street,still_indoor"
-LEARNING = [  # as in configs/encoder.yaml
+LEARNING = [  # of an encoder, on the worlds that the checkouts have in common
     *("--learning.objective=likelihood", "--gradient.objective=likelihood", f"--gradient.worlds=[{WORLDS}]"),
     *("--learning.predicted_share=0.5", "--learning.disturbance=1.2", "--gradient.fresh=1", "--gradient.workers=0"),
     *(

@@ -63,16 +63,14 @@ def survey(path: Path, options: ReadOptions) -> Survey:
     for line in _first_lines(path, seen, options.topic):
         _note(line, seen)
     kind = _choose_kind(path, seen.kinds, options.topic)
-    words = WORDS.get(kind, FRONT)
-    params = {key: value for word in words for key, value in seen.params.items() if word in key}
-    lines = seen.lines[kind]
+    lines, params = seen.lines[kind], _params(seen.params, WORDS.get(kind, FRONT))
     return Survey(
         kind=kind,
         clock=_choose_clock(np.array([line.stamps for line in lines])),
-        fov=_radians(_param(params, "fov")) or math.pi,
-        step=_believed_step(_radians(_param(params, "resolution")), len(lines[0].ranges)),
-        no_return=_no_return(lines, _param(params, "max")) if options.no_return is None else options.no_return,
-        mount=_mount(kind, lines[0], _param(params, "offset")),
+        fov=_radians(params.get("fov")) or math.pi,
+        step=_believed_step(_radians(params.get("resolution")), len(lines[0].ranges)),
+        no_return=_no_return(lines, params.get("max")) if options.no_return is None else options.no_return,
+        mount=_mount(kind, lines[0], params.get("offset")),
     )
 
 
@@ -124,8 +122,14 @@ def _choose_clock(stamps: Floats) -> int:
     return 0 if stands[0] < stands[1] else 1
 
 
-def _param(params: dict[str, float], word: str) -> float | None:
-    return next((value for key, value in params.items() if key.endswith(f"_{word}") and math.isfinite(value)), None)
+def _params(told: dict[str, float], words: tuple[str, ...]) -> dict[str, float]:
+    """What PARAM lines say of a laser, e.g. `robot_front_laser_max`: its last word -> value."""
+    found = {}
+    for key, value in told.items():
+        start, _, name = key.rpartition("_")
+        if start.endswith(words) and math.isfinite(value):
+            found[name] = value
+    return found
 
 
 def _radians(value: float | None) -> float | None:

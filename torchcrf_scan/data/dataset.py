@@ -13,7 +13,7 @@ from typing import overload
 import numpy as np
 
 from torchcrf_scan.data.pair_file import read_pair
-from torchcrf_scan.data.ros2_bag import METADATA
+from torchcrf_scan.data.ros2_bag import is_folder_bag
 from torchcrf_scan.scan import ScanPair
 
 
@@ -57,7 +57,7 @@ class PairFiles(Sequence[ScanPair]):
 
 def _matches(pattern: str | Path) -> list[Path]:
     path = Path(os.path.expanduser(pattern))
-    if path.is_file() or (path / METADATA).is_file():  # a bag of ROS 2 is a folder
+    if path.is_file() or is_folder_bag(path):
         return [path]
     found = list(path.glob("*.npz")) if path.is_dir() else [Path(name) for name in glob.glob(str(path), recursive=True)]
     files = [file for file in found if file.is_file()]

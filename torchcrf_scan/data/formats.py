@@ -20,6 +20,7 @@ from torchcrf_scan.data.ros_bag import read_folder_bag, read_mcap, read_ros1_bag
 from torchcrf_scan.data.text_lines import open_unpacked
 
 HEAD = 512  # bytes
+BINARY = b"\x80\x93"  # first bytes of a pickle and of an array of numpy
 
 Reader = Callable[[Path, ReadOptions], Iterator[Reading]]
 
@@ -46,7 +47,7 @@ def _is_csv(head: bytes) -> bool:
 
 
 def _is_text(head: bytes) -> bool:
-    return head.strip() != b"" and not any(byte < 9 or byte in (127, 128, 147) for byte in head)
+    return head.strip() != b"" and head[0] not in BINARY and min(head) >= ord("\t")
 
 
 PAIR = Format("pair file", _begins(ZIP), read_pair_scans)
@@ -67,7 +68,7 @@ def find_format(path: str | Path) -> Format | None:
     """The format of a file or folder; None if it is none of `FORMATS`. Raises OSError if it cannot be read."""
     path = Path(path)
     if path.is_dir():
-        return FOLDER if (path / ros2_bag.METADATA).is_file() else None
+        return FOLDER if ros2_bag.is_folder_bag(path) else None
     with open_unpacked(path) as file:
         try:
             head = file.read(HEAD)

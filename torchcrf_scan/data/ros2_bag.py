@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path, PurePath
+from typing import TYPE_CHECKING
 
 import yaml
 
 from torchcrf_scan.data.bag_records import Bag, Message, Topic, unpack_message
 from torchcrf_scan.data.mcap_bag import MAGIC, McapBag
 
+if TYPE_CHECKING:
+    import sqlite3
+
 SQLITE = b"SQLite format 3\0"
 METADATA = "metadata.yaml"
+SUFFIXES = (".mcap", ".db3")  # of the files in a folder that lacks it
 
 
 class SqliteBag:
@@ -24,6 +28,8 @@ class SqliteBag:
         self.path = path
 
     def _open(self) -> closing[sqlite3.Connection]:
+        import sqlite3  # some Pythons have none
+
         return closing(sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True))
 
     def topics(self) -> list[Topic]:
@@ -32,7 +38,7 @@ class SqliteBag:
             try:
                 definitions = self._definitions(base)
                 rows = base.execute("SELECT name, type FROM topics ORDER BY id").fetchall()
-            except sqlite3.Error as error:
+            except base.Error as error:
                 raise ValueError(f"{self.path}: expected a database with topics, got {error}") from error
         return [Topic(name, kind, *definitions.get(kind, ("", False))) for name, kind in rows]
 
@@ -57,25 +63,20 @@ class SqliteBag:
                 for row, name, stamp, data in base.execute(query):
                     if name in names:
                         yield Message(topics[name], 1e-9 * stamp, data, f"{self.path}, row {row}")
-            except sqlite3.Error as error:
+            except base.Error as error:
                 raise ValueError(f"{self.path}, behind row {row}: expected a whole database, got {error}") from error
 
 
 class FolderBag:
-    """A folder of ROS 2: its files one after the other, as `metadata.yaml` lists them.
+    """A folder of ROS 2: its files one after the other, as `metadata.yaml` lists them; without it, by name.
 
     Raises:
-        ValueError: metadata that are missing or damaged, files that are missing, of another format, or packed as a whole.
+        ValueError: damaged metadata, files that are missing, of another format, or packed as a whole.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            told = yaml.safe_load((path / METADATA).read_text())["rosbag2_bagfile_information"]
-            names = [PurePath(name).name for name in told["relative_file_paths"]]
-            mode = (told.get("compression_mode") or "none").lower()
-        except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path / METADATA}: expected a list of files, got {type(error).__name__}: {error}") from error
+        names, mode = _listed(path) if (path / METADATA).is_file() else (sorted(file.name for file in _bags_in(path)), "none")
         if mode not in ("none", "", "message"):
             raise ValueError(f"{path}: expected messages packed one by one or not at all, got files packed by {mode}")
         self._is_packed = mode == "message"
@@ -90,6 +91,24 @@ class FolderBag:
         for part in self._parts:
             for message in part.messages(names):
                 yield _unpacked(message) if self._is_packed else message
+
+
+def is_folder_bag(path: Path) -> bool:
+    """Whether a folder is a bag: it has metadata, or what a recorder leaves that was killed before it wrote them."""
+    return path.is_dir() and ((path / METADATA).is_file() or any(_bags_in(path)))
+
+
+def _listed(path: Path) -> tuple[list[str], str]:
+    """Files and kind of packing by the metadata of a folder."""
+    try:
+        told = yaml.safe_load((path / METADATA).read_text())["rosbag2_bagfile_information"]
+        return [PurePath(name).name for name in told["relative_file_paths"]], (told.get("compression_mode") or "none").lower()
+    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path / METADATA}: expected a list of files, got {type(error).__name__}: {error}") from error
+
+
+def _bags_in(path: Path) -> Iterator[Path]:
+    return (file for file in path.iterdir() if file.suffix in SUFFIXES and file.is_file())
 
 
 def _part(path: Path) -> Bag:

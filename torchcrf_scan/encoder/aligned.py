@@ -92,7 +92,7 @@ def own_channels(side: Side) -> tuple[Tensor, Tensor]:
     for k in (-1, 1):
         beside, there = along_scan(sweep, place + k)
         turn = rising_turn(k * (bearings.gather(1, beside) - bearings)) / sweep.step[:, None]
-        found.append(torch.log1p(torch.where(there, (turn - 1).clamp(0, LARGEST_TURN), LARGEST_TURN)))
+        found.append(torch.log1p(torch.where(there, (turn - 1).clamp(0.0, LARGEST_TURN), LARGEST_TURN)))
     found.append(torch.log(unit / sweep.noise[:, None].clamp(min=1e-9)).clamp(max=8.0) / 2 - 1)
     usual = torch.where(side.mask, ranges, torch.nan).nanmedian(1, keepdim=True).values.nan_to_num(nan=1.0)
     found.append(torch.log(ranges.clamp(min=1e-9) / usual.clamp(min=1e-9)).clamp(-3.0, 3.0))
@@ -116,7 +116,7 @@ def cross_channels(side: Side, moved: Tensor, unit: Tensor) -> tuple[Tensor, Ten
 
     arms, beam, there, bearing = arms[:, 0], beam[:, 0], there[:, 0], bearing.view(B, C, P)[:, 0]
     chord = arms[..., 1:, :] - arms[..., :-1, :]
-    share = (-(arms[..., :-1, :] * chord).sum(-1) / (chord**2).sum(-1).clamp(min=1e-12)).clamp(0, 1)
+    share = (-(arms[..., :-1, :] * chord).sum(-1) / (chord**2).sum(-1).clamp(min=1e-12)).clamp(0.0, 1.0)
     gap = torch.linalg.vector_norm(arms[..., :-1, :] + share[..., None] * chord, dim=-1) / unit[..., None]
     is_surface = there[..., 1:] & there[..., :-1] & (torch.linalg.vector_norm(chord, dim=-1) < LONGEST_CHORD * unit[..., None])
     surface = torch.minimum(gap.masked_fill(~is_surface, FARTHEST).amin(-1), nearest[:, 0])

@@ -29,6 +29,10 @@ class Extra(NamedTuple):
     outlier: Array
     moving: Array
 
+    def plus_moving(self, log_moving: Array) -> Extra:
+        """With more log potential of moving, (N,)."""
+        return self._replace(moving=self.moving + log_moving)
+
 
 def decode_pairs(
     pairs: Sequence[Pair], starts: Sequence[PairStart], extras: Sequence[Extra], fitted: Fitted, settings: Settings

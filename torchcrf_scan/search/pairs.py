@@ -23,6 +23,7 @@ from torchcrf_scan.loops.threads import for_each, in_parts
 from torchcrf_scan.search.accept import Score
 from torchcrf_scan.search.background import follow
 from torchcrf_scan.search.choose import FEWEST_POINTS, choose_movers
+from torchcrf_scan.search.expected import Expected
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.pool import Share, alone, find_background
 from torchcrf_scan.search.survey import Survey, grids_of, survey_at
@@ -35,9 +36,10 @@ def initialise(batch: ScanPairBatch, score: Score, clusters: int) -> Start:
     return start_tensors(start_pairs([pair_of(batch, b) for b in range(len(batch))], score, clusters), batch)
 
 
-def start_pairs(pairs: Sequence[Pair], score: Score, clusters: int) -> list[PairStart]:
-    """The same for pairs as arrays, each by itself."""
-    return of_pairs(lambda pair, share: start_pair(pair, score, clusters, share), pairs)
+def start_pairs(pairs: Sequence[Pair], score: Score, clusters: int, expected: Expected | None = None) -> list[PairStart]:
+    """The same for pairs as arrays, each by itself. expected: of a single pair, movers known from before."""
+    assert expected is None or len(pairs) == 1
+    return of_pairs(lambda pair, share: start_pair(pair, score, clusters, share, expected), pairs)
 
 
 def survey(batch: ScanPairBatch) -> list[Survey | None]:
@@ -52,11 +54,11 @@ def choose(batch: ScanPairBatch, surveys: Sequence[Survey | None], score: Score,
     return start_tensors(starts, batch)
 
 
-def survey_pair(pair: Pair, share: Share = alone) -> Survey | None:
+def survey_pair(pair: Pair, share: Share = alone, expected: Expected | None = None) -> Survey | None:
     """Surfaces, background and hypotheses; None if a scan has fewer than three points. share: see `background_pool`."""
     if pair.fewest_points < FEWEST_POINTS:
         return None
-    return survey_at(*find_start(pair, share), pair.dt)
+    return survey_at(*find_start(pair, share), pair.dt, expected)
 
 
 def find_start(pair: Pair, share: Share) -> tuple[ScanGrid, ScanGrid, Array]:
@@ -66,9 +68,9 @@ def find_start(pair: Pair, share: Share) -> tuple[ScanGrid, ScanGrid, Array]:
     return source, target, background if is_led else find_background(source, target, pair.initial_motion, share)
 
 
-def start_pair(pair: Pair, score: Score, clusters: int, share: Share = alone) -> PairStart:
+def start_pair(pair: Pair, score: Score, clusters: int, share: Share = alone, expected: Expected | None = None) -> PairStart:
     """InitialiseRT of one pair. clusters: C."""
-    return start_from(pair, survey_pair(pair, share), score, clusters)
+    return start_from(pair, survey_pair(pair, share, expected), score, clusters)
 
 
 def start_from(pair: Pair, seen: Survey | None, score: Score, clusters: int) -> PairStart:

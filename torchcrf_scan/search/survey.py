@@ -8,6 +8,7 @@ import numpy as np
 
 from torchcrf_scan.loops.jit import Array
 from torchcrf_scan.loops.pair import Pair
+from torchcrf_scan.search.expected import Expected, with_expected
 from torchcrf_scan.search.grid import ScanGrid, grid_of
 from torchcrf_scan.search.hypotheses import Hypotheses, hypothesise
 from torchcrf_scan.search.hypothesis_features import hypothesis_features
@@ -30,8 +31,13 @@ def grids_of(pair: Pair) -> tuple[ScanGrid, ScanGrid]:
     return grid_of(source), grid_of(target)
 
 
-def survey_at(source: ScanGrid, target: ScanGrid, background: Array, dt: float) -> Survey:
-    """Leftover of a background motion (3,), hypotheses of movers and their features. dt: seconds between the scans."""
+def survey_at(source: ScanGrid, target: ScanGrid, background: Array, dt: float, expected: Expected | None = None) -> Survey:
+    """Leftover of a background motion (3,), hypotheses of movers and their features.
+
+    dt: seconds between the scans. expected: movers known from before.
+    """
     leftover = leftover_of(source, target, background)
     hypotheses = hypothesise(leftover, dt)
+    if expected is not None and len(expected.motions) > 0:
+        hypotheses = with_expected(hypotheses, expected, leftover)
     return Survey(leftover, hypotheses, hypothesis_features(leftover, hypotheses))

@@ -7,6 +7,7 @@ import math
 from collections import deque
 
 USUAL = 0.1  # seconds between scans, before any is known
+LONGEST = 1e6  # seconds; a stamp that much later is none
 REMEMBERED = 15  # intervals of which the median is the usual one
 
 log = logging.getLogger(__name__)
@@ -26,23 +27,27 @@ class Clock:
         self._has_started = self._has_warned = False
 
     @property
+    def known(self) -> float | None:
+        """Seconds, the median of the last intervals; None before there is one."""
+        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else None
+
+    @property
     def usual(self) -> float:
-        """Seconds, the median of the last intervals."""
-        return sorted(self._intervals)[len(self._intervals) // 2] if self._intervals else USUAL
+        """Seconds between scans as far as known."""
+        return self.known or USUAL
 
     def advance(self, stamp: float) -> float:
         """Seconds since the scan before, above 0; 0 at the first scan. stamp: seconds, of the new scan."""
         since = stamp - self._last
-        interval = since if since > 0 else self.usual  # a stamp that is not finite compares as false
+        is_later = 0 < since < LONGEST  # false for what is not a number
+        interval = since if is_later else self.usual
         if not self._has_started:
             interval = 0.0
-        elif 0 < since < math.inf:
+        elif is_later:
             self._intervals.append(since)
         elif not self._has_warned and not math.isnan(self._last):
             self._has_warned = True
             log.warning("stamp %s after %s: expected a later one; taken as %.3g s later", stamp, self._last, interval)
-        if not math.isfinite(interval):
-            interval = self.usual
         self._has_started = True
         self._last = stamp if math.isfinite(stamp) else math.nan
         self.now += interval

@@ -20,16 +20,24 @@ class StreamConfig:
         keyframe_turn: or this many radians.
         least_share: of the returns that a motion must explain; otherwise the scan is not placed.
         gap: seconds without a placed scan after which the stream starts anew from the predicted pose.
+        memory: number of earlier scans asked what they saw where a point lies now,
+        memory_spacing: and seconds between them.
+        least_way: metres that a track goes before it counts as a moving object,
+        least_speed: or metres per second that it is fast.
         deskew: scans with beam times are corrected for the motion during their sweep.
     """
 
-    lag: Amount = 0.15
+    lag: Amount = 0.25
     history: Annotated[int, Within(1, 1000)] = 32
     keyframe_share: Share = 0.7
     keyframe_distance: Amount = 3.0
     keyframe_turn: Amount = 1.0
     least_share: Share = 0.2
     gap: Annotated[float, Within(0, above=True)] = 2.0
+    memory: Annotated[int, Within(0, 1000)] = 6
+    memory_spacing: Amount = 0.5
+    least_way: Amount = 0.3
+    least_speed: Amount = 0.5
     deskew: bool = True
 
     def __post_init__(self) -> None:

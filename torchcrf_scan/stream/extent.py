@@ -13,7 +13,7 @@ import numpy as np
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Bools, Floats, Ints
 
-GROWTH = 0.5  # share of the points' excess by which a box grows: a stray point in a single scan counts half
+GROWTH = 0.5  # share of the points' excess by which a box grows at a time
 
 
 class Interval(NamedTuple):
@@ -65,25 +65,25 @@ class View(NamedTuple):
 
     Attributes:
         shift: (2,) how far the box is to be moved to agree with the points; is_seen: (2,) whether that was observed.
-        growth: (2,) by which the box grows. drift: (2,) of its centre as it grows on one side; no motion of the object.
+        excess: (2,) of the points' size beyond the box's. side: (2,) in [-1, 1], where that lies: 1 in front, -1 behind.
     """
 
     shift: Floats
     is_seen: Bools
-    growth: Floats
-    drift: Floats
+    excess: Floats
+    side: Floats
 
 
-def look(seen: Interval, extent: Floats, sensor: Floats | None, noise: float) -> View:
+def look(seen: Interval, extent: Floats, sensor: Floats | None, noise: Floats) -> View:
     """Compares points with a box.
 
-    A face that the sensor looks at is where the points end, and the box grows away from it. Otherwise points that fill the box
-    have its middle, points within it tell nothing, and points beyond it push it.
+    A face that the sensor looks at is where the points end, and what is beyond the box lies on its other side. Otherwise points
+    that fill the box have its middle, points within it tell nothing, and points beyond it push it.
 
     Args:
         seen: of the points, relative to the box's centre. extent: (2,).
         sensor: (2,) position of the sensor in the box's frame; None: not known.
-        noise: standard deviation of where points end, metres.
+        noise: (2,) standard deviation of where points end, metres.
     """
     half = extent / 2
     front, back = seen.high - half, seen.low + half  # of the points beyond the box's
@@ -92,11 +92,10 @@ def look(seen: Interval, extent: Floats, sensor: Floats | None, noise: float) ->
     pushed = np.where(front > 0, front, np.minimum(back, 0))
     shift = np.where(is_full, seen.middle, pushed)
     is_seen = (is_full | (pushed != 0)) & ~is_larger
-    side = np.clip((front + back) / np.maximum(excess, 1e-9), -1, 1)  # 1: all of the excess is in front
+    side = np.clip((front + back) / np.maximum(excess, 1e-9), -1, 1)
     if sensor is not None:
         from_front, from_back = sensor > half, sensor < -half
         shift = np.where(from_front, front, np.where(from_back, back, shift))
         is_seen |= from_front | from_back
-        side = np.where(from_front, -1, np.where(from_back, 1, side))
-    growth = GROWTH * excess
-    return View(shift, is_seen, growth, side * growth / 2)
+        side = np.where(from_front, -1.0, np.where(from_back, 1.0, side))
+    return View(shift, is_seen, excess, side)

@@ -9,7 +9,6 @@ import numpy as np
 from torchcrf_scan.batch import range_noise_of
 from torchcrf_scan.fast.motion import METRICS
 from torchcrf_scan.fast.uncertainty import motion_covariance
-from torchcrf_scan.geometry import se2
 from torchcrf_scan.loops.candidates import by_motion
 from torchcrf_scan.prediction import LEAST_SHARE
 from torchcrf_scan.scan import Bools, Floats, Scan, ScanPair
@@ -18,6 +17,7 @@ from torchcrf_scan.search.grid import ScanGrid, grid_of
 from torchcrf_scan.search.leftover import leftover_of
 from torchcrf_scan.search.surface import surface_of
 
+TRUSTED = 0.8  # share of the points explained from which a refined motion is not doubted
 TIGHT = 1.0  # units of `leftover_of`: a return this near to a surface is explained by it
 
 
@@ -28,8 +28,8 @@ class Placement:
     Attributes:
         motion: (3,) `T_other_scan`. covariance: (3, 3) of it; large along what is not observed.
         share: of the points explained. explained: (P,) bool, which.
-        unobserved: (3, 3) projection on the unobserved directions (theta L, x, y) about `centre`; 0 where all are observed.
-        centre: (2,) of the explained points, in the other's frame. length: L, metres.
+        unobserved: (3, 3) projection on the unobserved directions (theta L, x, y) about the centre of the explained points, L their
+            mean distance from it; 0 where all are observed.
     """
 
     motion: Floats
@@ -37,8 +37,6 @@ class Placement:
     share: float
     explained: Bools
     unobserved: Floats
-    centre: Floats
-    length: float
 
     @property
     def is_degenerate(self) -> bool:
@@ -65,8 +63,8 @@ def place(grid: ScanGrid, other: ScanGrid, guess: Floats, factor: float = 1.0) -
     """
     motion = refine(guess[None], grid, other)[0]
     explained = explained_by(motion, grid, other)
-    if explained.sum() < explained_by(guess, grid, other).sum():  # it went astray
-        motion, explained = guess, explained_by(guess, grid, other)
+    if explained.mean() < TRUSTED and explained.sum() < (before := explained_by(guess, grid, other)).sum():  # it went astray
+        motion, explained = guess, before
     return placed(grid, other, motion, explained, factor)
 
 
@@ -82,21 +80,4 @@ def placed(grid: ScanGrid, other: ScanGrid, motion: Floats, explained: Bools, fa
         points, surface.points, surface.tangent, association, cluster, motion[None], line, unit, noise
     )
     rows = directions[0] * (information[0] < LEAST_SHARE)[:, None]
-    moved = se2.apply(motion, points[explained] if explained.any() else points)
-    centre = moved.mean(0)
-    length = float(np.sqrt(((moved - centre) ** 2).sum(1).mean() + noise**2))
-    return Placement(motion, factor * covariance[0], float(explained.mean()), explained, rows.T @ rows, centre, length)
-
-
-def following(placement: Placement, predicted: Floats) -> Floats:
-    """(3,) the placement's motion along what is observed, and the predicted one (3,) along what is not."""
-    if not placement.is_degenerate:
-        return placement.motion
-    ahead = se2.compose(placement.motion, se2.inverse(predicted))  # from where it is predicted to where it was placed
-    turn = float(ahead[0])
-    shift = se2.apply(ahead, placement.centre[None])[0] - placement.centre
-    local = np.array([turn * placement.length, *shift])
-    theta, x, y = (np.eye(3) - placement.unobserved) @ local
-    about = np.array([theta / placement.length, 0.0, 0.0])
-    to = placement.centre + np.array([x, y]) - se2.apply(about, placement.centre[None])[0]
-    return se2.compose(np.array([about[0], *to]), predicted)
+    return Placement(motion, factor * covariance[0], float(explained.mean()), explained, rows.T @ rows)

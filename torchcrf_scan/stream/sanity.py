@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, Ints
+from torchcrf_scan.scan import Bools, Floats
 from torchcrf_scan.search.background import refine
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.leftover import leftover_of
@@ -45,8 +45,3 @@ def _backed(motion: Floats, grid: ScanGrid, reference: ScanGrid, is_found: bool)
     left = leftover_of(grid, reference, motion)
     explained, back = (side.residual < TIGHT for side in (left.source, left.target))
     return Backed(motion, explained, float(min(explained.mean(), back.mean())), is_found)
-
-
-def labels_without_match(backed: Backed) -> Ints:
-    """(P,) what a motion explains is background, all else unknown."""
-    return np.where(backed.explained, BACKGROUND, OUTLIER)

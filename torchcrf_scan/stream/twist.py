@@ -31,8 +31,3 @@ def log(motion: Floats) -> Floats:
     size = sine**2 + versine**2
     x, y = motion[..., 1], motion[..., 2]
     return np.stack([theta, (sine * x + versine * y) / size, (sine * y - versine * x) / size], axis=-1)
-
-
-def part_of(motion: Floats, share: Floats | float) -> Floats:
-    """(..., 3) a share of a motion (3,) at constant velocity: 0 nothing, 1 all of it. share: (...,)."""
-    return exp(np.asarray(share)[..., None] * log(motion))

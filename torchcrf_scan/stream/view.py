@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torchcrf_scan.scan import Floats, Scan
 from torchcrf_scan.search.grid import ScanGrid
+from torchcrf_scan.stream.placement import grid_at
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +23,12 @@ class View:
     background: ScanGrid
     pose: Floats
     time: float
+
+    @classmethod
+    def of(cls, scan: Scan, pose: Floats, time: float) -> View:
+        """A scan of which nothing is known to move."""
+        grid = grid_at(scan, scan.points)
+        return cls(scan, grid, grid, pose, time)
 
 
 class History:

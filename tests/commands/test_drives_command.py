@@ -1,0 +1,38 @@
+"""`torchcrf-scan drives` on a short drive."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from command_line import run
+
+pytest.importorskip("trackeval", reason="needs trackeval (extra tracking)")
+
+
+def test_a_short_drive_is_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = run("drives", "--worlds", "[cars_240]", "--scans", "12", "--count", "1", "--json", str(tmp_path / "rows.json"))
+    assert code == 0
+    header, line, row = capsys.readouterr().out.splitlines()
+    assert header.startswith("| world | movers | found by pairs, % |")
+    assert row.startswith("| cars_240 |")
+    assert header.count("|") == line.count("|") == row.count("|")
+    values = json.loads((tmp_path / "rows.json").read_text())["cars_240"]
+    assert values["scans_per_second"] > 0
+    assert 0 <= values["false_moving"] < 20
+    assert 0 <= values["hota"] <= 100
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--worlds", "[street,moon]"], "--worlds: expected some of street, .* got moon"),
+        (["--scans", "1"], "--scans: expected at least 2, got 1"),
+        (["--count", "0"], "--count: expected at least 1, got 0"),
+    ],
+)
+def test_wrong_options_are_named(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("drives", *arguments) == 1
+    assert re.search(message, capsys.readouterr().err)

@@ -1,0 +1,76 @@
+"""`listen`: answers to a robot in another process, over the loopback interface alone."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import fail, run
+
+pytest.importorskip("cyclonedds", reason="the library cyclonedds is not installed (extra `ros2`)")
+pytest.importorskip("rosbags", reason="the library rosbags is not installed (extra `ros2`)")
+
+TESTS = Path(__file__).resolve().parents[1]
+LOGS = TESTS.parents[1] / "shared" / "data" / "logs"
+DOMAIN = 1 + os.getpid() % 100
+
+
+LINE = r"(\d+) scans, [\d.]+ a second; 0 bad, (\d+) lost; latency ([\d.]+) ms median, [\d.]+ ms 95 %, [\d.]+ ms greatest"
+
+
+def follow(folder: Path, source: object, count: int, *options: str) -> tuple[int, dict[str, Any]]:
+    """Listens to a robot in another process: the exit code, and what it was answered."""
+    path = os.pathsep.join([str(TESTS.parent), str(TESTS)])
+    command = [sys.executable, str(TESTS / "live_sender.py"), str(DOMAIN), str(count), str(source)]
+    environment = os.environ | {"PYTHONPATH": path}
+    with open(folder / "told.json", "w") as told, subprocess.Popen(command, stdout=told, env=environment):
+        code = run("listen", "--loopback=true", f"--domain={DOMAIN}", f"--scans={count}", "--seconds=50", *options)
+    return code, json.loads((folder / "told.json").read_text())
+
+
+def test_listen_follows_a_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, answers = follow(tmp_path, 5.0, 20, "--report=1", "--waiting=20")
+    assert code == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[0] == f"listening to /scan in domain {DOMAIN}"
+    assert len(out) > 3
+    found = re.fullmatch(LINE, out[-1])
+    assert found is not None
+    assert found.groups()[:2] == ("20", "0")
+    _, x, y, turn, *_ = np.array(answers["odometry"]).T
+    np.testing.assert_allclose(x, 0.2 * np.arange(20), atol=0.05)
+    np.testing.assert_allclose(y, 0, atol=0.05)
+    np.testing.assert_allclose(turn, 0, atol=0.02)
+
+
+@pytest.mark.skipif(not LOGS.is_dir(), reason="the recordings are not here")
+def test_listen_keeps_up_with_a_recorded_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """At its own speed, 12.5 scans a second."""
+    code, answers = follow(tmp_path, LOGS / "datmo_overtakes.bag", 200, "--report=0", "--waiting=20")
+    last = capsys.readouterr().out.splitlines()[-1]
+    print(last)
+    found = re.fullmatch(LINE, last)
+    assert code == 0
+    assert found is not None
+    assert int(found[1]) >= 195
+    assert len(answers["scan_static"]) >= 195
+    assert float(found[3]) < 200  # 25 on two idle cores
+
+
+def test_wrong_options_are_named(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "--waiting: expected at least 1 scan, got 0" in fail(capsys, "listen", "--waiting=0")
+    assert "domain: expected a number from 0 to 232, got 1000" in fail(capsys, "listen", "--domain=1000")
+    message = fail(capsys, "listen", "--topic=a b", "--loopback=true", f"--domain={DOMAIN + 101}")
+    assert "topic: expected a name like /scan, got 'a b'" in message
+    monkeypatch.setitem(sys.modules, "cyclonedds.domain", None)
+    assert "expected the library cyclonedds (extra `ros2`)" in fail(capsys, "listen")
+
+
+def test_listen_ends_without_scans(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("listen", "--loopback=true", f"--domain={DOMAIN + 100}", "--seconds=0.5") == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "no scans"
