@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from torchcrf_scan.whole_file import whole_path
 
 FOUND = "/torchcrf_scan/odometry"  # topic of the odometry that was found
 FRAME = "odom"  # its frame
-VERSION = 8  # of the metadata of a ROS 2 bag, which all distributions in use read
+VERSION: Literal[8] = 8  # of the metadata of a ROS 2 bag, which all distributions in use read
 STAMP_ERROR = 1e-6  # seconds
 XYZ = ("x", "y", "z")
 

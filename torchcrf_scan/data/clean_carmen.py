@@ -33,8 +33,8 @@ def writing_clean_carmen(source: Path, target: Path, options: ReadOptions) -> It
     Args:
         options: with which the source was read.
     """
-    with open(source, "rb") as file:
-        is_packed = file.read(len(GZIP)) == GZIP
+    with open(source, "rb") as original:
+        is_packed = original.read(len(GZIP)) == GZIP
     known, lines = survey(source, options), read_lines(source)
     with whole_file(target) as raw, gzip.GzipFile(fileobj=raw, mode="wb", filename="", mtime=0) if is_packed else raw as file:
 

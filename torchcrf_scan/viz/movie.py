@@ -95,8 +95,8 @@ def _writing_gif(path: Path, size: tuple[int, int], rate: float) -> Iterator[Wri
     """Keeps the frames with few colours until the end."""
     from PIL import Image as Images
 
-    palette, frames, stride = _palette(), [], 1
-    count = 0
+    frames: list[Picture] = []
+    palette, stride, count = _palette(), 1, 0
 
     def write(image: Image) -> None:
         nonlocal count, stride

@@ -88,7 +88,7 @@ class Summary:
             ax.plot(way[:, 1], way[:, 2], color=color, lw=1.5, alpha=0.85, zorder=4)
             if number in longest and lengths[number] > LEAST_TRACK:
                 label = ax.annotate(
-                    str(number), way[-1, 1:], (4, 4), textcoords="offset points", color=color, fontsize=8.5, zorder=6
+                    str(number), tuple(way[-1, 1:]), (4, 4), textcoords="offset points", color=color, fontsize=8.5, zorder=6
                 )
                 label.set(fontweight="bold", path_effects=_rim())
         self._legend(ax)

@@ -178,7 +178,7 @@ def _blueprint() -> Any:
     def since(boundary: Any) -> Any:
         return view.VisibleTimeRanges([VisibleTimeRange("time", start=boundary, end=TimeRangeBoundary.cursor_relative())])
 
-    shown = {
+    shown: Any = {
         "world/path": since(TimeRangeBoundary.infinite()),
         "world/static": since(TimeRangeBoundary.cursor_relative(seconds=-MAP_SECONDS)),
     }
