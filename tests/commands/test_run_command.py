@@ -47,7 +47,7 @@ def test_run_writes_everything(stream: FakeStream, log: Path, tmp_path: Path, ca
     path = read_trajectory(tmp_path / "out" / "poses.tum")
     np.testing.assert_allclose(path.stamps, 100 + 0.1 * np.arange(30))
     np.testing.assert_allclose(path.poses[:, 1], 0.1 * np.arange(1, 31))
-    rows = list(csv.DictReader((tmp_path / "out" / "tracks.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "out" / "tracks.csv").read_text().splitlines()))
     assert len(rows) == 30
     assert (rows[0]["id"], float(rows[0]["vy"])) == ("1", 1.0)
     with Image.open(tmp_path / "out" / "summary.png") as picture:
@@ -201,7 +201,7 @@ def test_the_real_stream_finds_the_way_along_a_room(tmp_path: Path) -> None:
 def test_torchrun_deals_logs_out(tmp_path: Path) -> None:
     logs = [carmen_log(tmp_path / f"{name}.log", 3) for name in "abc"]
     (tmp_path / "d.log").write_text("nothing\n")
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "--master-port=0", "-m", "torchcrf_scan", "run"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "torchcrf_scan", "run"]
     told = [*map(str, logs), str(tmp_path / "d.log"), "--output", str(tmp_path / "out"), "--threads=1"]
     done = subprocess.run([*command, *told], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1
