@@ -59,7 +59,8 @@ def test_an_empty_scan_and_a_jump_are_drawn() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seconds", "speed", "expected"), [(0.1, 1, (10, 1)), (0.025, 1, (20, 2)), (1.0, 1, (8, 1)), (0.1, 5, (25, 2)), (0.04, 1, (25, 1))]
+    ("seconds", "speed", "expected"),
+    [(0.1, 1, (10, 1)), (0.025, 1, (20, 2)), (1.0, 1, (8, 1)), (0.1, 5, (25, 2)), (0.04, 1, (25, 1))],
 )
 def test_movies_keep_the_pace_of_the_recording(seconds: float, speed: float, expected: tuple[float, int]) -> None:
     assert pace(seconds, speed) == (pytest.approx(expected[0]), expected[1])

@@ -19,7 +19,7 @@ def test_a_summary_shows_path_map_tracks_and_doubts() -> None:
     sensor = np.concatenate([line for line in lines if len(line) > 1])
     assert all(np.isclose(sensor, result.pose[1:]).all(axis=1).any() for result in results)
     assert len(lines[0]) > 50
-    assert [text.get_text() for text in figure.texts][0] == "drive_1"
+    assert figure.texts[0].get_text() == "drive_1"
     assert "lost 10.0 %" in figure.texts[1].get_text()
     seen = {one.number for result in results for one in result.objects if one.points}
     assert len(objects.collections) == len(seen)

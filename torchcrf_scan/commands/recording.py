@@ -29,6 +29,7 @@ from torchcrf_scan.viz.history import Tally
 MakeOutputs = Callable[[float], Mapping[str, Output]]  # of the seconds between two scans
 
 LOOK_AHEAD = 21  # readings from whose stamps the time between scans is found
+ROUNDING = 1e-6  # seconds; stamps have no more digits
 SECONDS = (0.005, 5.0)  # between scans, plausible ones
 
 
@@ -109,9 +110,9 @@ def chosen(readings: Iterable[Reading], options: Options) -> Iterator[Reading]:
     for reading in readings:
         first = reading.stamp if first is None else first
         since = reading.stamp - first
-        if options.end is not None and since > options.end:
+        if options.end is not None and since > options.end + ROUNDING:
             return
-        if since >= options.start:
+        if since >= options.start - ROUNDING:
             if count % options.every == 0:
                 yield reading
             count += 1

@@ -17,7 +17,6 @@ from torchcrf_scan.data.clean_log import clean_name, writing_clean
 from torchcrf_scan.data.recording import log_name
 from torchcrf_scan.learning.ranks import join
 from torchcrf_scan.pretrained import PRETRAINED
-from torchcrf_scan.viz.movie import can_write_mp4
 
 
 def run(
@@ -101,6 +100,8 @@ def _outputs(
     log: Path, folder: Path, options: Options, clean: bool, is_in_world: bool, speed: float, seconds: float
 ) -> Mapping[str, Output]:
     """All that is made of a log whose scans are `seconds` apart."""
+    from torchcrf_scan.viz.movie import can_write_mp4
+
     make_folder("--output", folder)
     movie = folder / ("movie.mp4" if can_write_mp4() else "movie.gif")
     outputs: dict[str, Output] = {

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,10 @@ def writing_clean_carmen(source: Path, target: Path, options: ReadOptions) -> It
     with open(source, "rb") as original:
         is_packed = original.read(len(GZIP)) == GZIP
     known, lines = survey(source, options), read_lines(source)
-    with whole_file(target) as raw, gzip.GzipFile(fileobj=raw, mode="wb", filename="", mtime=0) if is_packed else raw as file:
+    with whole_file(target) as raw, ExitStack() as stack:
+        file: Any = raw
+        if is_packed:
+            file = stack.enter_context(gzip.GzipFile(fileobj=raw, mode="wb", filename="", mtime=0))
 
         def put(text: str) -> None:
             file.write(f"{text}\n".encode())

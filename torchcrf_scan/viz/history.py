@@ -60,7 +60,7 @@ class Tally:
 
 
 class Path:
-    """Rows of numbers in the order of time, and always the last; at `limit` every second one goes, and later ones come as rarely."""
+    """Rows of numbers in the order of time, and always the last; at `limit` every second one goes, later ones come as rarely."""
 
     def __init__(self, width: int, limit: int = PATH) -> None:
         assert limit % 2 == 0

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 WIDTH, STRIP = 9.6, 0.8  # inches: of the map, and the height of what is drawn over time
 LEFT, RIGHT, TOP, BOTTOM, GAP = 0.6, 0.25, 1.0, 0.5, 0.22  # inches around them
-FLATTEST, TALLEST = 0.35, 1.1  # height over width of the map
+FLATTEST, TALLEST = 0.35, 0.85  # height over width of the map
 MAP = "#9AA3AD"
 LABELS = 40  # tracks with a number at most, the longest
 LEAST_BAR = 0.03  # share of the recording; shorter bars have no number
