@@ -36,8 +36,8 @@ class StreamConfig:
     gap: Annotated[float, Within(0, above=True)] = 2.0
     memory: Annotated[int, Within(0, 1000)] = 6
     memory_spacing: Amount = 0.5
-    least_way: Amount = 0.3
-    least_speed: Amount = 0.5
+    least_way: Amount = 0.4
+    least_speed: Amount = 0.7
     deskew: bool = True
 
     def __post_init__(self) -> None:

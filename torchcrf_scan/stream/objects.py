@@ -17,7 +17,7 @@ from torchcrf_scan.stream.memory import Memory, Votes
 from torchcrf_scan.stream.tracks import Tracker, TrackPrediction
 from torchcrf_scan.stream.view import View
 
-LOG_MOVED, LOG_STOOD = 2.0, 2.0  # log potentials for moving of a point that has moved, against it of one that has stood
+LOG_MOVED, LOG_STOOD = 1.0, 2.0  # log potentials for moving of a point that has moved, against it of one that has stood
 STOOD = 0.5  # share of a cluster's points that have stood, above which it does not move
 NEAR = 0.1  # metres from where a point of an object was expected, beside the track's own uncertainty,
 FARTHEST = 0.5  # at most
