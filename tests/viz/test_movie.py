@@ -82,6 +82,7 @@ def test_a_gif_holds_the_frames_in_their_colours(tmp_path: Path) -> None:
         assert picture.info["duration"] == 100
         picture.seek(8)
         np.testing.assert_allclose(np.asarray(picture.convert("RGB"))[5, 3], rgb(mover_look(1)[0]), atol=2)
+        assert (np.asarray(picture.convert("RGB"))[:, 100:] == 255).all()
     assert [path.name for path in tmp_path.iterdir()] == ["a.gif"]
 
 

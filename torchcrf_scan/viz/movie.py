@@ -122,9 +122,8 @@ def _palette() -> Picture:
 
     colors = [to_rgb(color) for color in (INK, SEEN, *STATUS_COLORS.values(), *MOVERS)]
     shares = np.linspace(0, 1, SHADES, endpoint=False)[:, None, None]
-    mixed = np.concatenate(
-        [(np.array(colors) * (1 - shares) + shares).reshape(-1, 3), np.linspace(0, 1, 64)[:, None].repeat(3, axis=1)]
-    )
+    greys = np.append(np.linspace(0, 0.95, 32), 1.0)  # nothing close to white, for which Pillow would take it
+    mixed = np.concatenate([(np.array(colors) * (1 - shares) + shares).reshape(-1, 3), greys[:, None].repeat(3, axis=1)])
     picture = Images.new("P", (1, 1))
     picture.putpalette((255 * mixed[:256]).round().astype(np.uint8).tobytes())
     return picture
