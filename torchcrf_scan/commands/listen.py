@@ -37,7 +37,7 @@ def listen(
     scans: int | None = None,
     model: str = PRETRAINED,
     device: str = "cpu",
-    threads: int | None = None,
+    threads: int = 1,
 ) -> int:
     """Subscribes to sensor_msgs/LaserScan of ROS 2 and publishes odometry, moving objects and the scan without them.
 
@@ -64,7 +64,7 @@ def listen(
         scans: ends after so many scans
         model: folder of a saved model, or the name of one that the package ships
         device: device that torch computes on, e.g. cpu or cuda
-        threads: number of threads that torch computes with; by default its own choice
+        threads: number of threads that torch computes with; scans come one after the other, so more only wait for each other
     """
     if waiting < 1:
         raise ValueError(f"--waiting: expected at least 1 scan, got {waiting}")

@@ -50,7 +50,7 @@ class Options:
     topic: str | None = None
     model: str = ""
     device: str = "cpu"
-    threads: int | None = None
+    threads: int = 1
     use_odometry: bool = False
     odometry: str | None = None
     no_return: float | None = None

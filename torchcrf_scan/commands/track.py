@@ -21,7 +21,7 @@ def track(
     no_return: float | None = None,
     model: str = PRETRAINED,
     device: str = "cpu",
-    threads: int | None = None,
+    threads: int = 1,
     use_odometry: bool = False,
     visualize: bool = False,
     rerun: str | None = None,
@@ -42,7 +42,7 @@ def track(
         no_return: readings in metres from there on mean that nothing came back; by default as the log says or shows
         model: folder of a saved model, or the name of one that the package ships
         device: device that torch computes on, e.g. cpu or cuda
-        threads: number of threads that torch computes with; by default its own choice
+        threads: number of threads that torch computes with; scans come one after the other, so more only wait for each other
         use_odometry: takes the log's odometry as the first guess of the sensor's motion
         visualize: shows everything in the viewer of rerun while it is computed
         rerun: file (.rrd) to write for that viewer

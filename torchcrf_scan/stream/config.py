@@ -27,7 +27,7 @@ class StreamConfig:
         deskew: scans with beam times are corrected for the motion during their sweep.
     """
 
-    lag: Amount = 0.25
+    lag: Amount = 0.15
     history: Annotated[int, Within(1, 1000)] = 32
     keyframe_share: Share = 0.7
     keyframe_distance: Amount = 3.0
