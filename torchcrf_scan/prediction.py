@@ -86,17 +86,17 @@ class Prediction:
     Attributes:
         association: (B, N) int64 target point, -1 outlier.
         cluster: (B, N) int64 0 background, 1..D-2 movers, -1 outlier.
-        motions: (B, D-1, 3) `T_target_source` of background and movers. With soft `motion_weights` the gradient reaches all that the
-            beliefs depend on; with hard ones (default) nothing learned, the points alone and, point-to-line, the start's motions.
-            Rows that are not active, and all with `motion_metric` given, are the start's. They jump where a cluster falls below
-            three points or `min_extent`.
+        motions: (B, D-1, 3) `T_target_source` of background and movers. With soft `motion_weights` the gradient reaches all that
+            the beliefs depend on; with hard ones (default) nothing learned, the points alone and, point-to-line, the start's
+            motions. Rows that are not active, and all with `motion_metric` given, are the start's. They jump where a cluster
+            falls below three points or `min_extent`.
         active: (B, D-1) bool, the clusters that exist. The others' motions are those of the start or of their last points.
         candidates: (B, N, K) int64 target point of every inlier association state.
         log_association: (B, N, K+1) normalised log-beliefs of the association chain, last = outlier; uniform in the padding.
             Differentiable at fixed candidates, 0 where -inf; jumps where a point's candidates change; kinks where the best
             labellings tie, but only at temperature 0.
-        log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier; likewise; jumps where two clusters are
-            merged.
+        log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier; likewise; jumps where two clusters
+            are merged.
         converged: (B,) bool, whether labels and motions had converged.
         iterations: (B,) int64 number of rounds.
         association_confidence: (B, N) in [0, 1], calibrated probability that the association is within two target points of the
