@@ -79,27 +79,31 @@ class Uncertainty:
 @tensor_tree
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Output of the model for a batch; tensors by point, batch first. The README lists the gradient of every output and its cost.
+    """Output of the model for a batch; tensors by point, batch first, each with its gradient.
 
     Integers and booleans have no gradient; no output has one with the schedule `flooding`.
 
     Attributes:
         association: (B, N) int64 target point, -1 outlier.
         cluster: (B, N) int64 0 background, 1..D-2 movers, -1 outlier.
-        motions: (B, D-1, 3) `T_target_source` of background and movers. Gradients reach learned parameters only if
-            `motion_weights` is soft; with hard ones they reach the points alone and, point-to-line, the start's motions.
+        motions: (B, D-1, 3) `T_target_source` of background and movers. With soft `motion_weights` the gradient reaches all that the
+            beliefs depend on; with hard ones (default) nothing learned, the points alone and, point-to-line, the start's motions.
+            Rows that are not active, and all with `motion_metric` given, are the start's. They jump where a cluster falls below
+            three points or `min_extent`.
         active: (B, D-1) bool, the clusters that exist. The others' motions are those of the start or of their last points.
         candidates: (B, N, K) int64 target point of every inlier association state.
         log_association: (B, N, K+1) normalised log-beliefs of the association chain, last = outlier; uniform in the padding.
-            Differentiable at fixed candidates; kinks where labellings tie, but only at temperature 0.
-        log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier; gradient likewise.
+            Differentiable at fixed candidates, 0 where -inf; jumps where a point's candidates change; kinks where the best
+            labellings tie, but only at temperature 0.
+        log_cluster: (B, N, D) normalised log-beliefs of the clustering chain, last = outlier; likewise; jumps where two clusters are
+            merged.
         converged: (B,) bool, whether labels and motions had converged.
         iterations: (B,) int64 number of rounds.
         association_confidence: (B, N) in [0, 1], calibrated probability that the association is within two target points of the
-            true one. None: the beliefs themselves. Gradient of the beliefs, at fixed labels.
+            true one. None: the beliefs themselves. Gradient of the beliefs, at fixed labels; log-beliefs below -50 count as -50.
         cluster_confidence: (B, N) in [0, 1], calibrated. None: the beliefs themselves. Gradient likewise.
-        uncertainty: covariances and unobserved directions of the motions; None for methods that do not provide them. Of these
-            the covariances have a gradient.
+        uncertainty: covariances and unobserved directions of the motions; None for methods that do not provide them. Of these the
+            covariances have a gradient, which jumps where a direction begins to count as not observed: no good goal of a loss.
     """
 
     association: Tensor

@@ -45,3 +45,7 @@ def test_time_always_advances(stamps: list[float]) -> None:
         interval = clock.advance(stamp)
         assert 0 < interval < math.inf
         assert clock.now >= before
+
+
+def test_stamps_that_differ_by_less_than_any_scanner_needs_count_as_the_usual_interval() -> None:
+    assert intervals(0.0, 1e-300, 2e-300, 1e-9) == [0.0, USUAL, USUAL, USUAL]

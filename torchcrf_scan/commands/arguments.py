@@ -119,6 +119,15 @@ def make_folder(option: str, folder: str | Path) -> Path:
     return Path(folder)
 
 
+def check_output(output: str, log: str) -> None:
+    """Raises ValueError for an output that is a folder, or would replace the log that it is made of."""
+    path = Path(output)
+    if path.is_dir():
+        raise ValueError(f"--output: expected a file to write, got {output!r}, a folder")
+    if path.exists() and Path(log).exists() and path.samefile(log):
+        raise ValueError(f"--output: expected another file than the log, got {output}")
+
+
 def batches(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
     """The items in their order, `BATCH` at a time."""
     for begin in range(0, len(items), BATCH):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from torchcrf_scan.commands.arguments import make_folder
+from torchcrf_scan.commands.arguments import check_output, make_folder
 from torchcrf_scan.commands.recording import Options, process_one
 from torchcrf_scan.pretrained import PRETRAINED
 
@@ -57,6 +57,7 @@ def play(
     options = Options(every, start, end, topic, model, device, threads, use_odometry, odometry, no_return, visualize, rerun)
     path = check_movie("--output", output)
     check_speed(speed)
+    check_output(output, log)
     make_folder("--output", path.parent)
     return process_one(
         "play",

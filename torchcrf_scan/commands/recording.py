@@ -23,6 +23,7 @@ from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.recording import log_name
 from torchcrf_scan.result import ScanResult
 from torchcrf_scan.scan import Floats, Scan
+from torchcrf_scan.stream.clock import Clock
 from torchcrf_scan.stream.stream import ScanStream
 from torchcrf_scan.viz.history import Tally
 
@@ -104,12 +105,14 @@ class Report:
 
 
 def chosen(readings: Iterable[Reading], options: Options) -> Iterator[Reading]:
-    """Every N-th reading between two times, seconds after the first one."""
-    first: float | None = None
-    count = 0
+    """Every N-th reading between two times, seconds after the first one.
+
+    Time is the stream's own: a stamp that goes back or is far off neither drops a reading nor ends the recording.
+    """
+    clock, count = Clock(warns=False), 0  # the stream warns
     for reading in readings:
-        first = reading.stamp if first is None else first
-        since = reading.stamp - first
+        clock.advance(reading.stamp)
+        since = clock.now
         if options.end is not None and since > options.end + ROUNDING:
             return
         if since >= options.start - ROUNDING:

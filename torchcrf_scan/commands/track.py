@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchcrf_scan.commands.arguments import make_folder
+from torchcrf_scan.commands.arguments import check_output, make_folder
 from torchcrf_scan.commands.recording import Options, process_one
 from torchcrf_scan.pretrained import PRETRAINED
 
@@ -50,5 +50,6 @@ def track(
     from torchcrf_scan.commands.outputs import tracks_file
 
     options = Options(every, start, end, topic, model, device, threads, use_odometry, odometry, no_return, visualize, rerun)
+    check_output(output, log)
     make_folder("--output", Path(output).parent)
     return process_one("track", log, options, lambda _: {output: tracks_file(Path(output))}, f"tracks in {output}")

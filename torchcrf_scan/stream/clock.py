@@ -7,6 +7,7 @@ import math
 from collections import deque
 
 USUAL = 0.1  # seconds between scans, before any is known
+SHORTEST = 1e-4  # seconds; no scanner is faster, and velocities over less are rounding
 LONGEST = 1e6  # seconds; a stamp that much later is none
 REMEMBERED = 15  # intervals of which the median is the usual one
 
@@ -16,15 +17,18 @@ log = logging.getLogger(__name__)
 class Clock:
     """A time that always advances: by the stamps where they do, else by the usual interval.
 
+    Args:
+        warns: says in the log when a stamp is not later than the one before, once.
+
     Attributes:
         now: seconds since the first scan.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, warns: bool = True) -> None:
         self.now = 0.0
         self._last = math.nan
         self._intervals: deque[float] = deque(maxlen=REMEMBERED)
-        self._has_started = self._has_warned = False
+        self._has_started, self._has_warned = False, not warns
 
     @property
     def known(self) -> float | None:
@@ -39,7 +43,7 @@ class Clock:
     def advance(self, stamp: float) -> float:
         """Seconds since the scan before, above 0; 0 at the first scan. stamp: seconds, of the new scan."""
         since = stamp - self._last
-        is_later = 0 < since < LONGEST  # false for what is not a number
+        is_later = SHORTEST <= since < LONGEST  # false for what is not a number
         interval = since if is_later else self.usual
         if not self._has_started:
             interval = 0.0

@@ -27,6 +27,8 @@ FEWEST_POINTS = 3  # fewer returns do not determine a motion
 LEAST_OF_INTERVAL = 0.1  # that remain between the times of two poses when the middles of their sweeps differ
 DOUBTED = 0.5  # a keyframe that explains less than this share of what the scan before explains is not believed
 ALIKE = 0.02  # metres or radians; poses this near explain the same
+FASTEST = 100.0  # metres a second, in at least one second, that odometry may go; more is a fault of it
+FARTHEST_GUESS = 1e5  # metres that it may go at all: the model takes guesses within 1e6
 ASTRAY = 0.5  # metres or radians between placements on both, from which the keyframe is not believed
 
 
@@ -80,8 +82,13 @@ class ScanStream:
             stamp: seconds, of its first beam. Stamps that stand still, go back or are not finite count as one usual interval
                 after the scan before.
             odometry: (3,) pose (theta, x, y) of the sensor by the wheels, in any frame that stays; its motion since the scan
-                before is the first guess. None or not finite: constant velocity.
+                before is the first guess. None, not finite or gone faster than `FASTEST`: constant velocity.
+
+        Raises:
+            ValueError: odometry of another shape.
         """
+        if odometry is not None and np.shape(odometry) != (3,):
+            raise ValueError(f"odometry: expected three numbers (theta, x, y), got shape {np.shape(odometry)}")
         interval = self._advance(scan, stamp)
         predicted = self._predict(interval, odometry)
         if len(scan) < FEWEST_POINTS:
@@ -130,9 +137,10 @@ class ScanStream:
         before, self._odometry, self._is_led = self._odometry, None, False
         if odometry is not None and np.isfinite(odometry).all():
             self._odometry = np.asarray(odometry, dtype=np.float64)
-            self._is_led = before is not None
-            if before is not None:
-                return se2.compose(self._pose, se2.compose(se2.inverse(before), self._odometry))
+            step = None if before is None else _step(before, self._odometry, interval)
+            self._is_led = step is not None
+            if step is not None:
+                return se2.compose(self._pose, step)
         if interval > self.config.gap:
             return self._pose
         return se2.compose(self._pose, twist.exp(interval * self._twist))
@@ -248,6 +256,14 @@ def explains_less(pose: Floats, guess: Floats, grid: ScanGrid, reference: View) 
         return False
     shares = [explained_by(se2.compose(se2.inverse(reference.pose), at), grid, reference.grid).mean() for at in (pose, guess)]
     return bool(shares[0] < LEAST_OF_BEST * shares[1])
+
+
+def _step(before: Floats, after: Floats, interval: float) -> Floats | None:
+    """(3,) the motion between two poses by the wheels; None if nothing goes so far in `interval` seconds."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        step = se2.compose(se2.inverse(before), after)
+        is_possible = float(np.hypot(step[1], step[2])) <= min(FASTEST * max(interval, 1.0), FARTHEST_GUESS)
+    return step if is_possible else None
 
 
 def labels_of(found: PairPrediction, backed: Backed, scan: Scan) -> Ints:

@@ -1,0 +1,24 @@
+"""Outputs never replace what they are made of."""
+
+from pathlib import Path
+
+import pytest
+
+from torchcrf_scan.commands.odometry import odometry
+from torchcrf_scan.commands.play import play
+from torchcrf_scan.commands.track import track
+
+
+@pytest.mark.parametrize("command", [odometry, track, play])
+def test_the_log_is_not_replaced(tmp_path: Path, command) -> None:  # type: ignore[no-untyped-def]
+    log = tmp_path / "room.gif"
+    log.write_text("as it was")
+    with pytest.raises(ValueError, match="expected another file than the log"):
+        command(str(log), str(log))
+    assert log.read_text() == "as it was"
+
+
+@pytest.mark.parametrize("command", [odometry, track])
+def test_a_folder_is_no_output(tmp_path: Path, command) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match="a folder"):
+        command("room.log", str(tmp_path))
