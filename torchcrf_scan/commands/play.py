@@ -50,6 +50,7 @@ def play(
         visualize: shows everything in the viewer of rerun while it is computed
         rerun: file (.rrd) to write for that viewer
     """
+    from torchcrf_scan.commands.apart import Apart
     from torchcrf_scan.commands.outputs import check_speed, movie_file
     from torchcrf_scan.viz.movie import check_movie
 
@@ -59,5 +60,9 @@ def play(
     check_output(output, log)
     make_folder("--output", path.parent)
     return process_one(
-        "play", log, options, lambda seconds: {output: movie_file(path, seconds, speed, frame == "world")}, f"movie in {output}"
+        "play",
+        log,
+        options,
+        lambda seconds: {output: Apart(movie_file, path, seconds, speed, frame == "world")},
+        f"movie in {output}",
     )

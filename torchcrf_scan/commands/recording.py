@@ -88,7 +88,7 @@ class Report:
 
     Attributes:
         tally: counts of its results. bad: number of scans that gave none; first_bad: why the first did not.
-        failures: what went wrong, one line each. rate: scans a second. is_interrupted: Ctrl-C ended it.
+        failures: what went wrong, one line each. rate: scans a second, until all is written. is_interrupted: Ctrl-C ended it.
     """
 
     tally: Tally = field(default_factory=Tally)
@@ -165,7 +165,7 @@ def process(
             if stopping.is_asked:
                 report.is_interrupted = True
                 break
-        report.rate = report.tally.scans / (perf_counter() - begin)
+    report.rate = report.tally.scans / (perf_counter() - begin)
     return report
 
 

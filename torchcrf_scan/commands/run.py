@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from torchcrf_scan.commands.apart import Apart
 from torchcrf_scan.commands.arguments import make_folder
 from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.commands.outputs import Output, check_speed, movie_file, poses_file, summary_picture, tracks_file, viewers
@@ -108,7 +109,7 @@ def _outputs(
         "poses.tum": poses_file(folder / "poses.tum"),
         "tracks.csv": tracks_file(folder / "tracks.csv"),
         "summary.png": summary_picture(folder / "summary.png", log_name(log)),
-        movie.name: movie_file(movie, seconds, speed, is_in_world),
+        movie.name: Apart(movie_file, movie, seconds, speed, is_in_world),
         **viewers(options.visualize, options.rerun),
     }
     if clean:
