@@ -59,7 +59,7 @@ def carmen_log(path: Path, scans: int = 30, fault: bool = False) -> Path:
         odometry = f"{0.1 * k:.3f} 0 0 {0.1 * k:.3f} 0 0 {100 + 0.1 * k:.3f} host {100 + 0.1 * k:.3f}"
         lines.append(f"FLASER 60 {' '.join(f'{value:.2f}' for value in ranges)} {odometry}\n")
     lines.append("TAIL kept\n")
-    path.write_text("".join(lines) + ("FLASER 60 1.0 2.0\n" if fault else ""))
+    path.write_text("".join(lines) + ("FLASER 60 1.0 2.0" if fault else ""))
     return path
 
 

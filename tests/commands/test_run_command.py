@@ -103,9 +103,22 @@ def test_a_bad_scan_is_left_out_and_counted(
     stream.bad = (3, 7)
     assert run("run", log, "--output", tmp_path / "out", "--clean") == 0
     assert "28 scans" in (told := capsys.readouterr().out)
-    assert "2 scans left out, the first because of scan 3 is bad" in told
+    assert "2 scans or messages left out, the first because of scan 3 is bad" in told
     assert len(read_trajectory(tmp_path / "out" / "poses.tum")) == 28
     assert (tmp_path / "out" / "clean.log").read_text().count("FLASER") == 28
+
+
+def test_a_malformed_line_is_left_out_and_counted(
+    stream: FakeStream, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = log.read_text().splitlines(keepends=True)
+    log.write_text("".join([*lines[:-5], "FLASER 60 1 two 3\n", *lines[-5:]]))
+    assert run("run", log, "--output", tmp_path / "out", "--clean") == 0
+    out, err = capsys.readouterr()
+    assert "30 scans, " in out
+    assert f"1 scans or messages left out, the first because of {log}, line {len(lines) - 4} (byte " in out
+    assert err == ""
+    assert (tmp_path / "out" / "clean.log").read_text().count("FLASER") == 30
 
 
 def test_several_logs_have_folders_and_a_bad_one_stops_no_other(

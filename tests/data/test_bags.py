@@ -283,3 +283,30 @@ def test_real_bags(name: str, scans: int, beams: int) -> None:
     readings = list(read_scans(LOGS / f"{name}.bag"))
     assert (len(readings), readings[0].scan.n_beams) == (scans, beams)
     assert all(reading.scan.times is not None for reading in readings)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("odometry", [None, "auto"])
+def test_malformed_messages_are_left_out_on_request(tmp_path: Path, form: str, odometry: str | None) -> None:
+    malformed = (
+        {"angle_increment": np.nan},
+        {"angle_increment": 0.0, "angle_max": -np.pi / 2},
+        {"angle_increment": 1.0},
+        {"angle_min": 1e9},
+    )
+    bad = [("/scan", LASER, 100.21 + 0.01 * k, laser(100.21, room(0.2), **fields)) for k, fields in enumerate(malformed)]
+    path, told = write(tmp_path, form, [*drive(5), *bad, *wheels(5)]), list[ValueError]()
+    readings = list(read_scans(path, odometry=odometry, on_bad=told.append))
+    np.testing.assert_allclose([reading.stamp for reading in readings], 100 + 0.1 * np.arange(5))
+    assert len(told) == len(malformed)
+    assert all("/scan: " in str(error) and str(error).startswith(str(path)) for error in told)
+    with pytest.raises(ValueError, match="/scan: "):
+        list(read_scans(path, odometry=odometry))
+
+
+def test_a_cut_bag_ends_the_reading_though_bad_messages_do_not(tmp_path: Path) -> None:
+    path, told = write(tmp_path, "ros1", drive(300)), list[ValueError]()
+    path.write_bytes(path.read_bytes()[:-5000])
+    with pytest.raises(ValueError, match="byte"):
+        list(read_scans(path, on_bad=told.append))
+    assert told == []

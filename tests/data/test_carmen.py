@@ -261,3 +261,33 @@ def test_real_logs(name: str, pairs: int, beams: int) -> None:
     assert len(log) == pairs
     assert log[0].source.n_beams == beams
     assert all(len(reading.scan) > 10 for reading in read_carmen(LOGS / f"{name}.log.gz"))
+
+
+@pytest.mark.parametrize("bad", ["FLASER 4 1 2 three 4 0 0 0 0 0 0 0.6 host 0.6", "FLASER 9 1 2", "FLASER"])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_malformed_lines_are_left_out_on_request(tmp_path: Path, bad: str, place: int) -> None:
+    lines, told = [line(*reading) for reading in READINGS], list[ValueError]()
+    lines.insert(place, f"{bad} ")
+    path = save(tmp_path, *lines)
+    assert len(list(read_carmen(path, ReadOptions(on_bad=told.append)))) == 3
+    assert [str(error).startswith(f"{path}, line {place + 1} ") for error in told] == [True]
+    with pytest.raises(ValueError, match=f"line {place + 1} "):
+        list(read_carmen(path))
+
+
+def test_absurd_bearings_are_left_out_on_request(tmp_path: Path) -> None:
+    steps = ("-1.0 2.0 0.5 8.0", "nan 2.0 0.5 8.0", "-1.0 2000 500 8.0", "-1.0 2.0 0.5 8.0")
+    lines = [modern("RAWLASER1", [1.0] * 5, 0.1 * k, geometry=step) for k, step in enumerate(steps)]
+    told = list[ValueError]()
+    assert len(list(read_carmen(save(tmp_path, *lines), ReadOptions(on_bad=told.append)))) == 2
+    assert ["line 2" in str(told[0]), "line 3" in str(told[1])] == [True, True]
+
+
+def test_a_cut_line_or_file_ends_the_reading(tmp_path: Path) -> None:
+    text = "\n".join(line(*reading) for reading in READINGS)
+    told = list[ValueError]()
+    for name, data in (("cut.log", text[:-40].encode()), ("cut.gz", gzip.compress(text.encode())[:-9])):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(ValueError, match=r"line \d \(byte"):
+            list(read_carmen(tmp_path / name, ReadOptions(on_bad=told.append)))
+    assert told == []

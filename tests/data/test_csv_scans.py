@@ -56,3 +56,17 @@ def test_wrong_rows_are_named(tmp_path: Path, rows: list[str], message: str) -> 
 def test_an_option_must_be_possible() -> None:
     with pytest.raises(ValueError, match="no_return: expected metres above 0, got 0"):
         ReadOptions(no_return=0)
+
+
+def test_malformed_rows_are_left_out_on_request(tmp_path: Path) -> None:
+    path, bad = save(tmp_path, HEAD, "0,1,2,3", "1,1,2", "2,1,two,3", ",1,2,3", "4,1,2,3"), list[ValueError]()
+    assert [reading.stamp for reading in read_scans(path, on_bad=bad.append)] == [0, 4]
+    assert [str(error).split("(")[0] for error in bad] == [f"{path}, line {number} " for number in (3, 4, 5)]
+
+
+def test_a_cut_row_ends_the_reading(tmp_path: Path) -> None:
+    path, found, bad = save(tmp_path, HEAD, "0,1,2,3", "1,1,2"), [], list[ValueError]()
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=r"line 3 .*: expected 4 fields, got 3"):
+        found.extend(read_scans(path, on_bad=bad.append))
+    assert (len(found), bad) == (1, [])

@@ -87,7 +87,7 @@ class Report:
     """What became of a recording.
 
     Attributes:
-        tally: counts of its results. bad: number of scans that gave none; first_bad: why the first did not.
+        tally: counts of its results. bad: number of scans and messages left out; first_bad: why the first was.
         failures: what went wrong, one line each. rate: scans a second, until all is written. is_interrupted: Ctrl-C ended it.
     """
 
@@ -98,9 +98,14 @@ class Report:
     rate: float = 0.0
     is_interrupted: bool = False
 
+    def leave_out(self, error: ValueError) -> None:
+        """Counts a bad scan or message."""
+        self.first_bad = self.first_bad or one_line(error)
+        self.bad += 1
+
     def describe(self) -> str:
         """One line."""
-        bad = f"; {self.bad} scans left out, the first because of {self.first_bad}" if self.bad else ""
+        bad = f"; {self.bad} scans or messages left out, the first because of {self.first_bad}" if self.bad else ""
         return f"{self.tally.describe()}; {self.rate:.1f} scans/s{bad}"
 
 
@@ -148,10 +153,12 @@ def process(
     """
     report, told = Report(), options.reading
     topic, odometry, no_return = told.topic, told.odometry, told.no_return
-    readings = until_fault(chosen(read_scans(log, topic, odometry=odometry, no_return=no_return), options), report.failures)
+    scans = read_scans(log, topic, odometry=odometry, no_return=no_return, on_bad=report.leave_out)
+    readings = until_fault(chosen(scans, options), report.failures)
     ahead = list(islice(readings, LOOK_AHEAD))
     if not ahead:
-        raise ValueError(report.failures[0] if report.failures else f"{log}: expected scans in the chosen time, got none")
+        nothing = f"{log}: expected scans in the chosen time, got none"
+        raise ValueError(next(iter(report.failures), report.first_bad or nothing))
     if options.has_odometry and all(reading.odometry is None for reading in ahead):
         raise ValueError(f"--use_odometry: expected a recording with odometry, got none in {log}")
     begin = perf_counter()
@@ -174,8 +181,7 @@ def _feed(stream: Stream, reading: Reading, options: Options, add: Add, report: 
     try:
         result = stream.feed(reading.scan, reading.stamp, reading.odometry if options.has_odometry else None)
     except ValueError as error:
-        report.first_bad = report.first_bad or one_line(error)
-        report.bad += 1
+        report.leave_out(error)
         return
     report.tally.add(result)
     add(result)

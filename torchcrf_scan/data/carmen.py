@@ -25,7 +25,8 @@ def read_carmen(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iterato
     found in the log (`no_return`). Odometry is that of the sensor; for RAWLASER lines, of the ODOM line before them.
 
     Raises:
-        ValueError: no scans; or, after every scan before it, a malformed line or damaged file, with line and byte.
+        ValueError: no scans; or, after every scan before it, a malformed line (unless `on_bad` takes it) or damaged file, with
+            line and byte.
         OSError: the file cannot be opened.
     """
     path = Path(path)
@@ -35,7 +36,14 @@ def read_carmen(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iterato
         if line.text.startswith("ODOM "):
             odometry = _read_odometry(line)
         elif kind_of(line.text) == known.kind:
-            yield _reading(read_laser_line(line, known.kind), known, odometry, line.where)
+            make = partial(_read_line, line, known, odometry)
+            reading = options.attempt(make) if line.is_whole else make()
+            if reading is not None:
+                yield reading
+
+
+def _read_line(line: Line, known: Survey, odometry: Floats | None) -> Reading:
+    return _reading(read_laser_line(line, known.kind), known, odometry, line.where)
 
 
 def _reading(laser: LaserLine, known: Survey, odometry: Floats | None, where: str) -> Reading:

@@ -51,6 +51,7 @@ class _Seen:
     kinds: Counter[str] = field(default_factory=Counter)
     params: dict[str, float] = field(default_factory=dict)
     lines: dict[str, list[LaserLine]] = field(default_factory=dict)
+    fault: ValueError | None = None
 
 
 def survey(path: Path, options: ReadOptions) -> Survey:
@@ -62,6 +63,8 @@ def survey(path: Path, options: ReadOptions) -> Survey:
     seen = _Seen()
     for line in _first_lines(path, seen, options.topic):
         _note(line, seen)
+    if seen.fault is not None and not seen.kinds:
+        raise seen.fault
     kind = _choose_kind(path, seen.kinds, options.topic)
     lines, params = seen.lines[kind], _params(seen.params, WORDS.get(kind, FRONT))
     return Survey(
@@ -99,9 +102,8 @@ def _note(line: Line, seen: _Seen) -> None:
     elif (kind := kind_of(line.text)) is not None:
         try:
             seen.lines.setdefault(kind, []).append(read_laser_line(line, kind))
-        except ValueError:
-            if not seen.kinds:  # nothing good before it
-                raise
+        except ValueError as error:
+            seen.fault = seen.fault or error
         else:
             seen.kinds[kind] += 1
 

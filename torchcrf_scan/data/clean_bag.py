@@ -88,7 +88,10 @@ class _Copy:
             if not self._is_scan(connection):
                 self._writer.write(self._connections[connection.id], stamp, data)
                 continue
-            message = self._reader.deserialize(data, connection.msgtype)
+            try:
+                message = self._reader.deserialize(data, connection.msgtype)
+            except Exception:  # a library's, of damaged bytes; there is no result of them
+                continue
             if is_scan_of(message, stamp, result):
                 clean = self._bytes(self._reader.typestore, blank(message, result.moving))
                 self._writer.write(self._connections[connection.id], stamp, clean)

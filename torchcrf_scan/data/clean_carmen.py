@@ -49,7 +49,7 @@ def writing_clean_carmen(source: Path, target: Path, options: ReadOptions) -> It
             for line in lines:
                 if kind_of(line.text) != known.kind:
                     put(line.text)
-                elif _is_scan_of(laser := read_laser_line(line, known.kind), known, result):
+                elif (laser := _laser(line, known)) is not None and _is_scan_of(laser, known, result):
                     put(blank(line, laser, known, result.moving))
                     return
             raise ValueError(f"{source}: expected the scan of {result.stamp:.6f} s, got no such line")
@@ -67,6 +67,14 @@ def _until_fault(lines: Iterator[Line]) -> Iterator[Line]:
         yield from lines
     except ValueError:
         return
+
+
+def _laser(line: Line, known: Survey) -> LaserLine | None:
+    """The scan of a line; None if it is malformed: then there is no result of it."""
+    try:
+        return read_laser_line(line, known.kind)
+    except ValueError:
+        return None
 
 
 def _is_scan_of(laser: LaserLine, known: Survey, result: ScanResult) -> bool:

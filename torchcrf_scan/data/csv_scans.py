@@ -11,6 +11,7 @@ The first row names the columns: `stamp` (seconds), perhaps the sensor's pose by
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +30,8 @@ def read_csv_scans(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iter
     """The scans of a CSV file, one row at a time.
 
     Raises:
-        ValueError: a first row of another layout; or, after every scan before it, a row that does not fit it or is cut, with
-            line and byte.
+        ValueError: a first row of another layout; or, after every scan before it, a row that does not fit it (unless `on_bad`
+            takes it) or is cut, with line and byte.
         OSError: the file cannot be opened.
     """
     lines = read_lines(Path(path))
@@ -38,9 +39,13 @@ def read_csv_scans(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iter
     if head is None:
         raise ValueError(f"{path}: expected a row of column names, got an empty file")
     has_odometry, bearings = _read_head(head)
+    no_return = np.inf if options.no_return is None else options.no_return
     for line in lines:
         if line.text.strip():
-            yield _read_row(line, has_odometry, bearings, np.inf if options.no_return is None else options.no_return)
+            make = partial(_read_row, line, has_odometry, bearings, no_return)
+            reading = options.attempt(make) if line.is_whole else make()
+            if reading is not None:
+                yield reading
 
 
 def _read_head(line: Line) -> tuple[bool, Floats]:

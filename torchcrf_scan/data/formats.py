@@ -83,7 +83,12 @@ def is_recording(path: str | Path) -> bool:
 
 
 def read_scans(
-    path: str | Path, topic: str | None = None, *, odometry: str | None = None, no_return: float | None = None
+    path: str | Path,
+    topic: str | None = None,
+    *,
+    odometry: str | None = None,
+    no_return: float | None = None,
+    on_bad: Callable[[ValueError], None] | None = None,
 ) -> Iterator[Reading]:
     """The scans of a recording in any format, one at a time; the options are those of `ReadOptions`.
 
@@ -92,7 +97,7 @@ def read_scans(
             its place.
         OSError: the file cannot be opened.
     """
-    return _reader(path)(Path(path), ReadOptions(topic, odometry, no_return))
+    return _reader(path)(Path(path), ReadOptions(topic, odometry, no_return, on_bad))
 
 
 def read_recording(path: str | Path, options: ReadOptions = AS_RECORDED) -> Recording:

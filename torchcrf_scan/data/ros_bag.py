@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,7 @@ def read_bag(bag: Bag, options: ReadOptions = AS_RECORDED) -> Iterator[Reading]:
 
     Raises:
         ValueError: no topic with scans, several and none chosen, or rosbags missing; or, after every scan before it, a message
-            that cannot be read or a damaged file, with its place.
+            that cannot be read (unless `on_bad` takes it) or a damaged file, with its place.
         OSError: the file cannot be opened.
     """
     topics = bag.topics()
@@ -36,9 +37,10 @@ def read_bag(bag: Bag, options: ReadOptions = AS_RECORDED) -> Iterator[Reading]:
     read = _Reader(bag, topics, scans, math.inf if options.no_return is None else options.no_return)
     if odometry is None:
         for message in bag.messages([scans.name]):
-            yield read.scan(message)[0]
+            if (found := options.attempt(partial(read.scan, message))) is not None:
+                yield found[0]
         return
-    yield from _with_odometry(bag, read, topics, scans, odometry)
+    yield from _with_odometry(bag, read, topics, scans, odometry, options)
 
 
 def read_ros1_bag(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iterator[Reading]:
@@ -119,17 +121,22 @@ class _Reader:
         return Reading(scan, stamp_of(told.header) or message.stamp), told.header.frame_id
 
 
-def _with_odometry(bag: Bag, read: _Reader, topics: list[Topic], scans: Topic, odometry: Topic) -> Iterator[Reading]:
+def _with_odometry(
+    bag: Bag, read: _Reader, topics: list[Topic], scans: Topic, odometry: Topic, options: ReadOptions
+) -> Iterator[Reading]:
     beside = OdometryBeside()
     transforms = [topic.name for topic in topics if topic.type in (TRANSFORMS, OLD_TRANSFORMS)]
     try:
         for message in bag.messages([scans.name, odometry.name, *transforms]):
             if message.topic.name == scans.name:
-                yield from beside.scan(*read.scan(message))
+                if (found := options.attempt(partial(read.scan, message))) is not None:
+                    yield from beside.scan(*found)
+            elif (told := options.attempt(partial(read.decode, message))) is None:
+                continue
             elif message.topic.name == odometry.name:
-                yield from beside.pose(read.decode(message))
+                yield from beside.pose(told)
             else:
-                beside.transform(read.decode(message))
+                beside.transform(told)
     except ValueError:
         yield from beside.rest()
         raise

@@ -19,13 +19,14 @@ class Line:
     """A line without its end.
 
     Attributes:
-        number: from 1. offset: of its first byte in the unpacked text. where: file, line and byte, for errors.
+        number: from 1. offset: of its first byte in the unpacked text. is_whole: it has an end; a cut file's last one has none.
     """
 
     text: str
     number: int
     offset: int
     path: Path
+    is_whole: bool = True
 
     @property
     def where(self) -> str:
@@ -43,7 +44,7 @@ def read_lines(path: Path) -> Iterator[Line]:
     number, offset = 1, 0
     with open_unpacked(path) as file:
         while raw := _next_line(file, path, number, offset):
-            yield Line(raw.decode("utf-8", errors="replace").rstrip("\r\n"), number, offset, path)
+            yield Line(raw.decode("utf-8", errors="replace").rstrip("\r\n"), number, offset, path, raw.endswith(b"\n"))
             number, offset = number + 1, offset + len(raw)
 
 

@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from torchcrf_scan.data.spatial_covariance import spatial_covariance
 from torchcrf_scan.live.types import LASER, MARKER, MARKERS, OBSTACLE, OBSTACLES, ODOMETRY, new
 from torchcrf_scan.result import MovingObject, ScanResult
-from torchcrf_scan.scan import Bools, Floats
+from torchcrf_scan.scan import Bools
 
 CUBE, ARROW = 1, 0  # of visualization_msgs/Marker
 HEIGHT = 1.0  # metres that objects are drawn high
 SHOWN = 500_000_000  # nanoseconds for which a marker is shown
 LEAST_EXTENT = 0.05  # metres; markers of no extent are not drawn
-FIXED = 1e-6  # variance of what a planar sensor does not do: rise, roll and pitch
-AXES = (5, 0, 1)  # of (theta, x, y) in (x, y, z, roll, pitch, yaw)
 COLOURS = ((0.90, 0.29, 0.24), (0.18, 0.53, 0.87), (0.95, 0.61, 0.13), (0.33, 0.69, 0.31), (0.58, 0.35, 0.78), (0.10, 0.69, 0.69))
 SESSION = secrets.token_bytes(8)  # so that numbers of objects are not those of another run
 
@@ -30,20 +29,12 @@ def odometry(result: ScanResult, stamp: Any, world: str, sensor: str) -> Any:
         ODOMETRY,
         header={"stamp": stamp, "frame_id": world},
         child_frame_id=sensor,
-        pose={"pose": _pose(x, y, theta), "covariance": spatial(result.covariance)},
+        pose={"pose": _pose(x, y, theta), "covariance": spatial_covariance(result.covariance).tolist()},
         twist={
             "twist": {"linear": {"x": ahead, "y": left}, "angular": {"z": turn}},
-            "covariance": spatial(result.twist_covariance),
+            "covariance": spatial_covariance(result.twist_covariance).tolist(),
         },
     )
-
-
-def spatial(covariance: Floats) -> list[float]:
-    """(36,) covariance of (x, y, z, roll, pitch, yaw) from that of (theta, x, y); never singular."""
-    full = FIXED * np.eye(6)
-    full[np.ix_(AXES, AXES)] = covariance
-    full[AXES, AXES] = np.maximum(full[AXES, AXES], FIXED)
-    return full.ravel().tolist()
 
 
 def markers(objects: tuple[MovingObject, ...], stamp: Any, world: str) -> Any:
