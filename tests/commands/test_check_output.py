@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from command_line import fail, run
 
 from torchcrf_scan.commands.odometry import odometry
 from torchcrf_scan.commands.play import play
@@ -22,3 +23,12 @@ def test_the_log_is_not_replaced(tmp_path: Path, command) -> None:  # type: igno
 def test_a_folder_is_no_output(tmp_path: Path, command) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match="a folder"):
         command("room.log", str(tmp_path))
+
+
+def test_run_does_not_replace_its_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "tracks.csv"
+    assert run("simulate", "--output", log, "--drive=3", "--simulator.beams=31") == 0
+    before = log.read_bytes()
+    capsys.readouterr()
+    assert "expected another file than the log" in fail(capsys, "run", log, "--output", tmp_path)
+    assert log.read_bytes() == before
