@@ -144,11 +144,11 @@ time.sleep(100)
     hanging = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
     stopper = threading.Thread(target=lambda: hanging.stdout and hanging.stdout.readline() and hanging.send_signal(signal.SIGSTOP))
     stopper.start()
-    with tempfile.TemporaryFile("w+") as told, robot(told, domain, 300, 40.0) as process:
+    with tempfile.TemporaryFile("w+") as told, robot(told, domain, 100, 40.0) as process:
         answered = list(listener.listen(lambda: process.poll() is not None))
         assert not stopper.is_alive(), "it did not hang"
         hanging.kill()
         hanging.communicate()
         told.seek(0)
-        assert len(json.load(told)["scan_static"]) == 300
-    assert len(answered) == 300
+        assert len(json.load(told)["scan_static"]) == 100
+    assert len(answered) == 100

@@ -124,6 +124,12 @@ def check_output(output: str, log: str) -> None:
     path = Path(output)
     if path.is_dir():
         raise ValueError(f"--output: expected a file to write, got {output!r}, a folder")
+    check_other(output, log)
+
+
+def check_other(output: str, log: str) -> None:
+    """Raises ValueError for an output that would replace the log that it is made of."""
+    path = Path(output)
     if path.exists() and Path(log).exists() and path.samefile(log):
         raise ValueError(f"--output: expected another file than the log, got {output}")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from torchcrf_scan.commands.apart import Apart
-from torchcrf_scan.commands.arguments import check_output, make_folder
+from torchcrf_scan.commands.arguments import check_other, make_folder
 from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.commands.outputs import Output, check_speed, movie_file, poses_file, summary_picture, tracks_file, viewers
 from torchcrf_scan.commands.recording import MakeOutputs, Options, Stream, process
@@ -105,9 +105,9 @@ def _outputs(
 
     make_folder("--output", folder)
     for name in ("poses.tum", "tracks.csv", "summary.png", "movie.mp4", "movie.gif"):
-        check_output(str(folder / name), str(log))
+        check_other(str(folder / name), str(log))
     if options.rerun is not None:
-        check_output(options.rerun, str(log))
+        check_other(options.rerun, str(log))
     movie = folder / ("movie.mp4" if can_write_mp4() else "movie.gif")
     outputs: dict[str, Output] = {
         "poses.tum": poses_file(folder / "poses.tum"),
