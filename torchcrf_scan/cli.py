@@ -9,6 +9,8 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any
 
 from jsonargparse import ActionYesNo, ArgumentParser
 
@@ -24,6 +26,7 @@ from torchcrf_scan.commands.odometry import odometry
 from torchcrf_scan.commands.play import play
 from torchcrf_scan.commands.plot import plot
 from torchcrf_scan.commands.prepare import prepare
+from torchcrf_scan.commands.recording import Options
 from torchcrf_scan.commands.run import run
 from torchcrf_scan.commands.simulate import simulate
 from torchcrf_scan.commands.track import track
@@ -60,6 +63,9 @@ FLAGS: Mapping[str, str] = {  # parameter that is true or false: help
 }
 
 
+SHARED = "options"  # parameter of commands that take the fields of `Options` as options
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit code; bad usage and `--help` raise `SystemExit`, as in argparse.
 
@@ -70,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parsed = parser.parse_args(None if argv is None else list(argv))
     try:
         options = parser.instantiate(parsed)[parsed.command]
-        code = COMMANDS[parsed.command](**vars(options))
+        code = COMMANDS[parsed.command](**arguments_of(COMMANDS[parsed.command], vars(options)))
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output closed the pipe (`| head`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -81,6 +87,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     return code
+
+
+def arguments_of(command: Callable[..., int], values: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of a command; options that several commands share come as one `Options`."""
+    if SHARED not in inspect.signature(command).parameters:
+        return values
+    shared = {field.name: values.pop(field.name) for field in fields(Options)}
+    return {**values, SHARED: Options(**shared)}
 
 
 def make_parser() -> ArgumentParser:
@@ -104,9 +118,12 @@ def _command_parser(name: str, command: Callable[..., int], summary: str) -> Arg
     for key, (metavar, count, meaning) in POSITIONAL.items():
         if key in parameters:
             parser.add_argument(key, type=str, metavar=metavar, nargs=count, help=meaning)
-    parser.add_function_arguments(command, as_group=False, as_positional=False, skip={*POSITIONAL, *FLAGS})
+    parser.add_function_arguments(command, as_group=False, as_positional=False, skip={*POSITIONAL, *FLAGS, SHARED})
+    if SHARED in parameters:
+        parser.add_class_arguments(Options, as_group=False, skip={*FLAGS})
+    names = {*parameters, *(field.name for field in fields(Options) if SHARED in parameters)}
     for key, meaning in FLAGS.items():
-        if key in parameters:
+        if key in names:
             parser.add_argument(f"--{key}", action=ActionYesNo, default=False, help=meaning)
     return parser
 

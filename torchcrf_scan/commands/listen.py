@@ -70,25 +70,20 @@ def listen(
         raise ValueError(f"--waiting: expected at least 1 scan, got {waiting}")
     network = Network(domain, (LOOPBACK,), LOOPBACK) if loopback else Network(domain, peers, interface)
     answering = ScanStream(load_model(model, None, device, threads), stream)
-    connection = Connection(network)
-    listener = Listener(
-        connection,
-        answering,
-        topic=topic,
-        prefix=prefix,
-        no_return=no_return,
-        odometry=odometry,
-        world=world,
-        depth=waiting,
-    )
+    names = {"topic": topic, "prefix": prefix, "world": world}
+    listener = Listener(Connection(network), answering, odometry=odometry, no_return=no_return, depth=waiting, **names)
     print(f"listening to {topic} in domain {network.number}", flush=True)
-    counted = Report(report)
-    try:
-        for answered in listener.listen(_limit(counted, seconds, scans)):
-            counted.add(answered)
-    finally:
-        print(counted.line(), flush=True)
+    _count(listener, Report(report), seconds, scans)
     return 0
+
+
+def _count(listener: Listener, report: Report, seconds: float | None, scans: int | None) -> None:
+    """Listens for so long, or to so many scans, and tells how it goes."""
+    try:
+        for answered in listener.listen(_limit(report, seconds, scans)):
+            report.add(answered)
+    finally:
+        print(report.line(), flush=True)
 
 
 def _limit(report: Report, seconds: float | None, scans: int | None) -> Callable[[], bool]:

@@ -21,6 +21,7 @@ from torchcrf_scan.data.formats import read_scans
 from torchcrf_scan.data.options import AUTO, ReadOptions
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.recording import log_name
+from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.result import ScanResult
 from torchcrf_scan.scan import Floats, Scan
 from torchcrf_scan.stream.clock import Clock
@@ -41,20 +42,35 @@ class Stream(Protocol):
         """What is known after one more scan."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Options:
-    """How recordings are read and processed, as the commands' options of the same names."""
+    """How recordings are read and processed: options that `run`, `odometry`, `track` and `play` share.
+
+    Attributes:
+        every: takes each N-th scan only
+        start: seconds after the first scan at which to begin
+        end: seconds after the first scan at which to end
+        topic: topic of the scans in a bag, if there are several; of a CARMEN log the kind of lines, e.g. RLASER
+        odometry: topic of odometry in a bag that has several, to be used
+        no_return: readings in metres from there on mean that nothing came back; by default as the log says or shows
+        model: folder of a saved model, or the name of one that the package ships
+        device: device that torch computes on, e.g. cpu or cuda
+        threads: number of threads that torch computes with; scans come one after the other, so more only wait for each other
+        use_odometry: takes the log's odometry as the first guess of the sensor's motion
+        visualize: shows everything in the viewer of rerun while it is computed
+        rerun: file (.rrd) to write for that viewer
+    """
 
     every: int = 1
     start: float = 0.0
     end: float | None = None
     topic: str | None = None
-    model: str = ""
+    odometry: str | None = None
+    no_return: float | None = None
+    model: str = PRETRAINED
     device: str = "cpu"
     threads: int = 1
     use_odometry: bool = False
-    odometry: str | None = None
-    no_return: float | None = None
     visualize: bool = False
     rerun: str | None = None
 
@@ -80,6 +96,9 @@ class Options:
         """A maker of streams that share one model; raises ValueError for a model or device that is not there."""
         model = load_model(self.model, None, self.device, self.threads)
         return lambda: ScanStream(model)
+
+
+DEFAULTS = Options()
 
 
 @dataclass

@@ -12,33 +12,21 @@ from torchcrf_scan.commands.apart import Apart
 from torchcrf_scan.commands.arguments import check_other, make_folder
 from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.commands.outputs import Output, check_speed, movie_file, poses_file, summary_picture, tracks_file, viewers
-from torchcrf_scan.commands.recording import MakeOutputs, Options, Stream, process
+from torchcrf_scan.commands.recording import DEFAULTS, MakeOutputs, Options, Stream, process
 from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
 from torchcrf_scan.data.clean_log import clean_name, writing_clean
 from torchcrf_scan.data.recording import log_name
 from torchcrf_scan.learning.ranks import join
-from torchcrf_scan.pretrained import PRETRAINED
 
 
 def run(
     logs: list[str],
     output: str,
+    options: Options = DEFAULTS,
     *,
-    every: int = 1,
-    start: float = 0.0,
-    end: float | None = None,
-    topic: str | None = None,
-    odometry: str | None = None,
-    no_return: float | None = None,
-    model: str = PRETRAINED,
-    device: str = "cpu",
-    threads: int = 1,
-    use_odometry: bool = False,
     clean: bool = False,
     frame: Literal["world", "sensor"] = "world",
     speed: float = 1.0,
-    visualize: bool = False,
-    rerun: str | None = None,
 ) -> int:
     """Finds the sensor's path and the moving objects of logs: poses.tum, tracks.csv, summary.png and movie.mp4 in OUTPUT.
 
@@ -49,30 +37,18 @@ def run(
     Args:
         logs: recordings
         output: folder of the files, created if necessary; earlier ones of the same names are replaced
-        every: takes each N-th scan only
-        start: seconds after the first scan at which to begin
-        end: seconds after the first scan at which to end
-        topic: topic of the scans in a bag, if there are several; of a CARMEN log the kind of lines, e.g. RLASER
-        odometry: topic of odometry in a bag that has several, to be used
-        no_return: readings in metres from there on mean that nothing came back; by default as the log says or shows
-        model: folder of a saved model, or the name of one that the package ships
-        device: device that torch computes on, e.g. cpu or cuda
-        threads: number of threads that torch computes with; scans come one after the other, so more only wait for each other
-        use_odometry: takes the log's odometry as the first guess of the sensor's motion
+        options: of reading and processing
         clean: also writes the log again without the beams that hit moving objects, and a bag with the odometry found
         frame: what stands still in the movie, world or sensor
         speed: of the movie, as a multiple of the log's own
-        visualize: shows everything in the viewer of rerun while it is computed
-        rerun: file (.rrd) to write for that viewer
     """
-    options = Options(every, start, end, topic, model, device, threads, use_odometry, odometry, no_return, visualize, rerun)
     folders = _folders(logs, Path(output))
     check_speed(speed)
-    if rerun is not None and len(logs) > 1:
-        raise ValueError(f"--rerun: expected one log to write {rerun} of, got {len(logs)}")
-    if clean and every > 1:
-        raise ValueError(f"--clean: expected every scan to be taken, got --every {every}")
-    viewers(visualize, rerun)  # an error now, not after the first scans
+    if options.rerun is not None and len(logs) > 1:
+        raise ValueError(f"--rerun: expected one log to write {options.rerun} of, got {len(logs)}")
+    if clean and options.every > 1:
+        raise ValueError(f"--clean: expected every scan to be taken, got --every {options.every}")
+    viewers(options.visualize, options.rerun)  # an error now, not after the first scans
     make_stream = options.make_stream()
     failures: list[str] = []
     with join("cpu") as ranks, Stopping() as stopping:
