@@ -110,7 +110,7 @@ def _converted(name: str, hint: Any, value: Any) -> Any:
     if get_origin(base) is tuple:
         return tuple(_converted(name, get_args(base)[0], of) for of in value)
     converted = base(value) if base in (bool, int, float) else value
-    if not all(bound.allows(converted) for bound in bounds):
+    if converted is not None and not all(bound.allows(converted) for bound in bounds):
         raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
     return converted
 

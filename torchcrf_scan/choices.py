@@ -21,6 +21,7 @@ class Variant:
         takes_extras: `forward` accepts embeddings and extra log potentials, including those of an encoder.
         is_exportable: the rounds can be exported as a program without Python (`export`).
         in_loops: implemented by the loops (`fast`) too.
+        takes_limit: outliers can be told by a distance in metres.
     """
 
     function: str = ""
@@ -28,6 +29,7 @@ class Variant:
     takes_extras: bool = True
     is_exportable: bool = True
     in_loops: bool = True
+    takes_limit: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +84,7 @@ SCHEDULES: Mapping[str, Schedule] = {
         takes_extras=False,
         is_exportable=False,
         in_loops=False,
+        takes_limit=False,
         takes_couplings=False,
     ),
 }
@@ -97,6 +100,7 @@ COUPLINGS: Mapping[str, Coupling] = {
         likelihood="variants.lattice_likelihood:pseudo_log_likelihood",
         chain="variants.lattice_likelihood:lattice_chain",
         in_loops=False,
+        takes_limit=False,
     ),
 }
 CHAINS: Mapping[str, Chains] = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from torchcrf_scan.checks import Amount, OneOf, Within, check_fields
@@ -53,6 +53,8 @@ class InferenceConfig:
             or `eager` (tensors); `auto`: compiled where that is possible.
         rotation_tolerance: radians; a motion whose rotation changes by less has converged.
         translation_tolerance: metres; a motion whose translation changes by less has converged.
+        outlier_distance: metres; a point is an outlier where its nearest target point under its own motion is farther, and only
+            there; null: as learned, in units of spacing.
     """
 
     clusters: Annotated[int, Within(2, 32)] = 8
@@ -71,6 +73,7 @@ class InferenceConfig:
     backend: Annotated[str, OneOf("auto", "compiled", "eager")] = "auto"
     rotation_tolerance: Amount = 1e-4
     translation_tolerance: Amount = 1e-3
+    outlier_distance: Annotated[float | None, Within(0, above=True)] = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -173,8 +176,16 @@ class ModelConfig:
         two_chains = " or ".join(name for name, coupling in COUPLINGS.items() if not coupling.chain)
         if is_one_chain and not (self.has_association and self.has_clusters):
             raise ValueError(f"coupling: expected {two_chains} for the {self.chains} chain alone, got {self.coupling}")
+        if self.inference.outlier_distance is not None:
+            self.require("takes_limit", "with outlier_distance")
         if is_one_chain and not SCHEDULES[schedule].takes_couplings:
             raise ValueError(f"coupling: expected {two_chains} with schedule {schedule}, got {self.coupling}")
+
+    def with_limit(self, outlier_distance: float | None) -> ModelConfig:
+        """The settings with this `outlier_distance`; None: the same. Raises ValueError for one that they do not take."""
+        if outlier_distance is None:
+            return self
+        return replace(self, inference=replace(self.inference, outlier_distance=outlier_distance))
 
     @property
     def has_association(self) -> bool:

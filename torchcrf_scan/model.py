@@ -115,11 +115,18 @@ class JointScanCRF(nn.Module):
         """All fitted quantities, as the inference functions take them."""
         return Parameters(*self.weight_vectors, self.scales, self.boosters, self.calibration, self.cluster_potential)
 
-    def view(self, batch: ScanPairBatch, learned: LearnedInputs | None = None) -> PairView:
-        """The batch prepared for the features, computed once. learned: output of `learned_inputs`."""
+    def view(
+        self, batch: ScanPairBatch, learned: LearnedInputs | None = None, outlier_distance: float | Tensor | None = None
+    ) -> PairView:
+        """The batch prepared for the features, computed once.
+
+        Args:
+            learned: output of `learned_inputs`. outlier_distance: as in `forward`.
+        """
         features = self.config.features
+        limit = self.config.inference.outlier_distance if outlier_distance is None else outlier_distance
         has_lengths = not {f"association.{name}" for name in SCALED_EDGES} <= {*features.left_out}
-        return PairView.of(batch, features.wrap_closed, features.length_unit, learned, features.reach, has_lengths)
+        return PairView.of(batch, features.wrap_closed, features.length_unit, learned, features.reach, has_lengths, limit)
 
     def learned_inputs(
         self,
@@ -182,7 +189,7 @@ class JointScanCRF(nn.Module):
         if begin is None:
             return found
         with torch.autocast(batch.source.device.type, enabled=False):  # centimetres decide which movers are found
-            view = self.view(batch)
+            view = replace(self.view(batch), limit=None)  # of the motions to be found from here
             return view.in_metres(begin(view, view.in_unit(found), self.fitted, self.config.inference))
 
     def forward(
@@ -193,6 +200,7 @@ class JointScanCRF(nn.Module):
         source_embedding: Tensor | None = None,
         target_embedding: Tensor | None = None,
         extra_log_unary: ExtraLogUnary | None = None,
+        outlier_distance: float | Tensor | None = None,
     ) -> Prediction:
         """Labels, motions and log-beliefs of every pair.
 
@@ -202,45 +210,67 @@ class JointScanCRF(nn.Module):
             source_embedding, target_embedding: (B, N, C), (B, M, C) of the points, for a model with `features.embedding`: similar
                 ones are associated. InitialiseRT does not use them. None: the term is left out.
             extra_log_unary: (B, N) learned log potentials of outliers and of moving points.
+            outlier_distance: metres; a point is an outlier where its nearest target point under its own motion is farther, and
+                only there (`features.limit`). None: `InferenceConfig.outlier_distance`, by default as learned. A tensor () may
+                have a gradient, computed by the rounds in tensors.
 
         Raises:
-            ValueError: an input whose shape, dtype or device does not fit the batch or the model.
+            ValueError: an input whose shape, dtype or device does not fit the batch or the model, or that it does not take.
         """
         start = start or self.initialise(batch)  # InitialiseRT
         learned = self.learned_inputs(  # of the encoder and of the caller
             batch, start, source_embedding=source_embedding, target_embedding=target_embedding, extra_log_unary=extra_log_unary
         )
-        return self.decode(batch, start, learned)
+        return self.decode(batch, start, learned, outlier_distance)
 
-    def decode(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None = None) -> Prediction:
+    def decode(
+        self,
+        batch: ScanPairBatch,
+        start: Start,
+        learned: LearnedInputs | None = None,
+        outlier_distance: float | Tensor | None = None,
+    ) -> Prediction:
         """The rounds from a start, with the output of `learned_inputs`: `forward` without its first two steps."""
-        rounds = self._in_loops if self._suits_loops(self.config, batch, start, learned) else self._in_tensors  # the engine
-        return rounds(batch, start, learned)  # potentials, messages, motions, repeated until convergence
+        limit = outlier_distance.item() if isinstance(outlier_distance, Tensor) else outlier_distance
+        config = self.config.with_limit(limit)
+        if self._suits_loops(config, batch, start, learned, outlier_distance):  # the engine
+            return self._in_loops(config, batch, start, learned)  # potentials, messages, motions, repeated until convergence
+        return self._in_tensors(batch, start, learned, outlier_distance)  # likewise
 
-    def _suits_loops(self, config: ModelConfig, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> bool:
+    def _suits_loops(
+        self,
+        config: ModelConfig,
+        batch: ScanPairBatch,
+        start: Start,
+        learned: LearnedInputs | None,
+        outlier_distance: float | Tensor | None = None,
+    ) -> bool:
         """Whether the loops can compute the rounds: on a CPU, for supported settings and gradients."""
         inputs = {"batch.source": batch.source, "batch.target": batch.target, "batch.initial_motion": batch.initial_motion}
         inputs |= {"start.motions": start.motions} | ({} if start.reach is None else {"start.reach": start.reach})
         inputs |= dict(self.boosters.named_parameters(prefix="boosters"))
+        inputs |= {"outlier_distance": outlier_distance} if isinstance(outlier_distance, Tensor) else {}
         slopes = [name for name, tensor in inputs.items() if torch.is_grad_enabled() and tensor.requires_grad]
         has_embeddings = learned is not None and learned.embeddings is not None
         is_transformed = is_in_transform(*self.parameters(), *inputs.values())
         return can_decode(config, batch.source.device, slopes=slopes, has_embeddings=has_embeddings, is_transformed=is_transformed)
 
-    def _in_loops(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
+    def _in_loops(self, config: ModelConfig, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
         """The rounds in machine code, one pair per thread, there and back."""
-        if self._needs_gradient(learned) and self.config.inference.iterations > 0:
-            return adjoint.predict(batch, start, self.fitted, self.config, learned)
-        return predict(batch, start, fitted_of(self.fitted), settings_of(self.config), learned)
+        if self._needs_gradient(learned) and config.inference.iterations > 0:
+            return adjoint.predict(batch, start, self.fitted, config, learned)
+        return predict(batch, start, fitted_of(self.fitted), settings_of(config), learned)
 
     def _needs_gradient(self, learned: LearnedInputs | None) -> bool:
         extra = () if learned is None else (learned.outlier, learned.moving)
         wanted = (*self.association_weights.values(), *self.clustering_weights.values(), *extra)
         return torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in wanted)
 
-    def _in_tensors(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None) -> Prediction:
+    def _in_tensors(
+        self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None, outlier_distance: float | Tensor | None
+    ) -> Prediction:
         """The rounds in tensors, all pairs at once, with a gradient if the schedule supports it."""
-        view = self.view(batch, learned)  # features, in their unit of length
+        view = self.view(batch, learned, outlier_distance)  # features, in their unit of length
         decode = DECODERS[self.config.inference.schedule]
         found = decode(view, view.in_unit(start), self.fitted, self.config)
         return view.in_metres(found)  # metres
@@ -254,7 +284,7 @@ class JointScanCRF(nn.Module):
         """
         if config.inference.iterations > 0 and self._suits_loops(config, batch, start, learned):
             return adjoint.unroll(batch, start, self.fitted, config, learned, last)
-        view = self.view(batch, learned)
+        view = self.view(batch, learned, config.inference.outlier_distance)
         rounds = sweep.rounds(view, view.in_unit(start), self.fitted, config)[-last:]
         distance, looks = self.scales.cluster_distance, config.inference.backend != "eager"
         merged = [replace(done, state=joint.merge_alike(view, done.state, distance, looks=looks)) for done in rounds]
@@ -304,6 +334,7 @@ class JointScanCRF(nn.Module):
         *,
         initial_motion: Sequence[float] | None = None,
         expected: Expected | None = None,
+        outlier_distance: float | None = None,
     ) -> PairPrediction:
         """Association, cluster and motions of one pair, by beam of `source`.
 
@@ -311,27 +342,34 @@ class JointScanCRF(nn.Module):
             initial_motion: a guess (theta, tx, ty) of the background's motion, e.g. from odometry; used as one more initial
                 hypothesis, never taken unchecked.
             expected: what is known of the movers from before; likewise. Used where the loops answer, on a CPU.
+            outlier_distance: metres, as in `forward`.
         """
         pair = ScanPair(source, target, dt, initial_motion=None if initial_motion is None else np.asarray(initial_motion))
-        return self._match([pair], expected)[0]
+        return self._match([pair], expected, outlier_distance)[0]
 
     @torch.no_grad()
-    def match_pairs(self, pairs: Sequence[ScanPair], batch_size: int = 16) -> list[PairPrediction]:
-        """Predictions of many pairs, in batches of `batch_size`."""
+    def match_pairs(
+        self, pairs: Sequence[ScanPair], batch_size: int = 16, *, outlier_distance: float | None = None
+    ) -> list[PairPrediction]:
+        """Predictions of many pairs, in batches of `batch_size`. outlier_distance: metres, as in `forward`."""
         found: list[PairPrediction] = []
         for begin in range(0, len(pairs), batch_size):
-            found += self._match(pairs[begin : begin + batch_size])
+            found += self._match(pairs[begin : begin + batch_size], outlier_distance=outlier_distance)
         return found
 
-    def _match(self, pairs: Sequence[ScanPair], expected: Expected | None = None) -> list[PairPrediction]:
+    def _match(
+        self, pairs: Sequence[ScanPair], expected: Expected | None = None, outlier_distance: float | None = None
+    ) -> list[PairPrediction]:
         """Predictions of one batch of pairs: in arrays throughout where the loops compute the rounds, else in padded tensors.
 
         expected: of a single pair.
         """
         reference = self.association_weights["sequence"]
-        has_embeddings = self.config.encoder.embedding > 0
-        if not (STARTS[self.config.start].in_loops and can_decode(self.config, reference.device, has_embeddings=has_embeddings)):
-            prediction = self(ScanPairBatch.collate(pairs, reference.dtype).without_truth().to(reference.device))
+        config = self.config.with_limit(outlier_distance)
+        has_embeddings = config.encoder.embedding > 0
+        if not (STARTS[config.start].in_loops and can_decode(config, reference.device, has_embeddings=has_embeddings)):
+            batch = ScanPairBatch.collate(pairs, reference.dtype).without_truth().to(reference.device)
+            prediction = self(batch, outlier_distance=outlier_distance)
             return [prediction.pair(b, pair) for b, pair in enumerate(pairs)]
         scans = [pair_of_scans(pair, reference.dtype) for pair in pairs]
         starts = start_pairs(scans, score_of(self.hypothesis_score), self.config.motions, expected)
@@ -340,7 +378,7 @@ class JointScanCRF(nn.Module):
         )
         if expected is not None:
             extras = [extras[0].plus_moving(expected.log_moving)]
-        answers = decode_pairs(scans, starts, extras, fitted_of(self.fitted), settings_of(self.config))
+        answers = decode_pairs(scans, starts, extras, fitted_of(self.fitted), settings_of(config))
         return [by_beam(answer, pair) for answer, pair in zip(answers, pairs, strict=True)]
 
     def save_pretrained(self, folder: str | Path) -> None:

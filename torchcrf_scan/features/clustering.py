@@ -49,6 +49,11 @@ def correspond(
     return Correspondence(moved, torch.linalg.vector_norm(moved - met, dim=-1), partner, is_inlier)
 
 
+def nearest_distance(at: Correspondence, target_points: Tensor, nearest: Tensor) -> Tensor:
+    """(B, N, C) distance to the nearest target point under every motion. target_points: (B, M, 2); nearest: (B, N, C)."""
+    return torch.linalg.vector_norm(at.moved - gather_points(target_points, nearest), dim=-1)
+
+
 def local_features(at: Correspondence, active: Tensor, scales: Scales) -> Tensor:
     """C1..C4: cluster distance, outlier, cluster inlier (inlier part, outlier part).
 

@@ -17,6 +17,7 @@ from torchcrf_scan.features.candidates import Candidates
 from torchcrf_scan.features.extension import association_extension, clustering_extension
 from torchcrf_scan.features.free_space import Sweep, look
 from torchcrf_scan.features.learned import LearnedInputs, add_log
+from torchcrf_scan.features.limit import SOFTNESS, Limit
 from torchcrf_scan.features.scales import Scales, robust_square
 from torchcrf_scan.features.shape import ShapeDescriptors, describe, local_spacing
 from torchcrf_scan.geometry import se2
@@ -57,6 +58,7 @@ class PairView:
         source_sweep, target_sweep: the scans in polar coordinates about their sensors.
         learned: embeddings and extra log potentials; None: none.
         reach: as in `FeatureConfig`. has_lengths: whether the model has the association chain's features P3 and P4.
+        limit: distance of outliers; None: as learned.
     """
 
     batch: ScanPairBatch
@@ -68,6 +70,7 @@ class PairView:
     learned: LearnedInputs | None = None
     reach: str = "hard"
     has_lengths: bool = True
+    limit: Limit | None = None
 
     @classmethod
     def of(
@@ -78,6 +81,7 @@ class PairView:
         learned: LearnedInputs | None = None,
         reach: str = "hard",
         has_lengths: bool = True,
+        outlier_distance: float | Tensor | None = None,
     ) -> PairView:
         """Computes the descriptors of both scans.
 
@@ -85,8 +89,12 @@ class PairView:
             wrap_closed: neighbours wrap on a closed scan (A-06); off, they clamp as in the paper.
             length_unit: `metre`, or `spacing`: lengths relative to the resolution of the pair's scans.
             learned, reach, has_lengths: see above.
+            outlier_distance: metres, as in `InferenceConfig`.
         """
         factor = torch.ones_like(batch.dt) if length_unit == "metre" else REFERENCE_UNIT / resolution(batch)
+        limit = None
+        if outlier_distance is not None:
+            limit = Limit(outlier_distance * factor, SOFTNESS * resolution(batch) * factor)
         batch = batch.scaled(factor)
         both = batch.source_closed, batch.target_closed
         source_closed, target_closed = both if wrap_closed else (torch.zeros_like(closed) for closed in both)
@@ -101,6 +109,7 @@ class PairView:
             learned,
             reach,
             has_lengths,
+            limit,
         )
 
     def within(self, reach: Tensor | None) -> Tensor | None:

@@ -17,7 +17,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.choices import MOTION_METRICS
 from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features import clustering
-from torchcrf_scan.features.association import pairwise_features
+from torchcrf_scan.features.association import pairwise_features, registered_distance
 from torchcrf_scan.features.candidates import Candidates, with_targets
 from torchcrf_scan.features.learned import association_extra, clustering_extra
 from torchcrf_scan.features.potentials import (
@@ -189,8 +189,10 @@ def update_clusters(
     pairwise = clustering.pairwise_features(batch.source, at, scales)
     possible = possible_clusters(state.motions.active, view.within(start.reach), batch.source.shape[1])
     extra = clustering_extra(view.learned, possible.shape[-1])
-    potentials = clustering_potentials(local, pairwise, possible, parameters.clustering, extra)
-    log_cluster = chain_beliefs(*potentials, batch.source_mask, config.temperature, in_loops=config.backend != "eager")
+    unary, edges = clustering_potentials(local, pairwise, possible, parameters.clustering, extra)
+    if view.limit is not None:
+        unary = view.limit.joined(unary, clustering.nearest_distance(at, batch.target, found.nearest))
+    log_cluster = chain_beliefs(unary, edges, batch.source_mask, config.temperature, in_loops=config.backend != "eager")
     labels = cluster_labels(log_cluster.argmax(-1), log_cluster.shape[-1] - 1, batch.source_mask)
     return replace(state, log_cluster=log_cluster, cluster=labels)
 
@@ -208,8 +210,10 @@ def update_association(view: PairView, state: State, found: Candidates, paramete
     unary = association_unary(view, states, moved, scales, boosters)
     pairwise = pairwise_features(batch.source, batch.target, found.index, scales, has_lengths=view.has_lengths)
     extra = association_extra(view.learned, found.index)
-    potentials = association_potentials(unary, pairwise, found.mask, parameters.association, extra)
-    log_association = chain_beliefs(*potentials, batch.source_mask, config.temperature, in_loops=config.backend != "eager")
+    unary, edges = association_potentials(unary, pairwise, found.mask, parameters.association, extra)
+    if view.limit is not None:
+        unary = view.limit.joined(unary, registered_distance(moved, batch.target, found.index))
+    log_association = chain_beliefs(unary, edges, batch.source_mask, config.temperature, in_loops=config.backend != "eager")
     labels = association_labels(log_association.argmax(-1), found.index, batch.source_mask)
     return replace(state, candidates=found.index, candidate_mask=found.mask, log_association=log_association, association=labels)
 
