@@ -16,6 +16,7 @@ from jsonargparse import ActionYesNo, ArgumentParser
 
 from torchcrf_scan import __version__
 from torchcrf_scan.commands.bench import bench
+from torchcrf_scan.commands.calibrate import calibrate
 from torchcrf_scan.commands.drives import drives
 from torchcrf_scan.commands.evaluate import evaluate
 from torchcrf_scan.commands.experiment import experiment, experiment_parser
@@ -39,6 +40,7 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
     "simulate": simulate,
     "match": match,
     "evaluate": evaluate,
+    "calibrate": calibrate,
     "experiment": experiment,
     "plot": plot,
     "listen": listen,

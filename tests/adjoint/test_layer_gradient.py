@@ -70,7 +70,9 @@ def assert_alike(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
 
 @pytest.mark.parametrize("world", ["street", "model_cars_dominant"])
 @pytest.mark.parametrize("metric", ["line", "point", "given"])
-@pytest.mark.parametrize("settings", [{}, {"stop_early": False}, {"detach_motion": True}, {"motion_weights": "hard"}], ids=str)
+@pytest.mark.parametrize(
+    "settings", [{}, {"stop_early": False}, {"detach_motion": True}, {"motion_weights": "hard"}, {"outlier_distance": 0.3}], ids=str
+)
 def test_gradients_are_those_of_the_tensors(world: str, metric: str, settings: dict[str, Any]) -> None:
     settings = {"motion_weights": "soft", "motion_metric": metric} | settings
     expected, slopes_expected, _ = slopes(world, "eager", **settings)

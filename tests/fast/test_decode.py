@@ -34,6 +34,8 @@ CONFIGS: dict[str, dict[str, Any]] = {
     "one round": {"iterations": 1},
     "no rounds": {"iterations": 0},
     "two clusters": {"clusters": 2},
+    "limit": {"outlier_distance": 0.12},
+    "tight limit": {"outlier_distance": 0.03},
 }
 
 

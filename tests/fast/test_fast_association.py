@@ -15,6 +15,7 @@ from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.fast import association, static_features
+from torchcrf_scan.fast.limit import Limit
 from torchcrf_scan.features import potentials
 from torchcrf_scan.features.association import pairwise_features
 from torchcrf_scan.features.free_space import look
@@ -27,6 +28,7 @@ from torchcrf_scan.loops.nearest import boxes_of
 PAIRS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pairs"
 MOTIONS = torch.tensor([[0.02, 0.5, 0.1], [3.0, 9.0, 9.0], [0.0, 1.5, 0.1], [0.1, 0.1, -0.4]], dtype=torch.float64)
 ACTIVE = torch.tensor([True, False, True, True])
+NO_LIMIT = Limit(0.0, 1.0)
 
 
 @cache
@@ -90,8 +92,8 @@ def assert_same_round(batch: ScanPairBatch, parameters: Parameters, count: int =
         seen = array(sight.seen_through[0]), array(sight.hidden[0])
         log_unary, log_pairwise, expected = eager(view, parameters, index, mask, moved)
         work = work or static_features.workspace(*index.shape)
-        log_association, labels = association.associate(model, pair, work, index, mask, found, *seen, np.zeros(N))
-        ours = association.log_unary_of(model, pair, work, found, *seen)
+        log_association, labels = association.associate(model, pair, work, index, mask, NO_LIMIT, found, *seen, np.zeros(N))
+        ours = association.log_unary_of(model, pair, work, NO_LIMIT, found, *seen)
         np.testing.assert_allclose(ours, log_unary, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(association.log_pairwise_of(model, pair, index), log_pairwise, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(log_association, expected, rtol=1e-9, atol=1e-8)
@@ -165,11 +167,13 @@ def test_candidates_that_are_not_real() -> None:
     model = static_features.association_model(parameters)
     sight = look(view.target_sweep, view.batch.source)
     found, labels = association.associate(
-        model, pair, work, index, mask, source, array(sight.seen_through[0]), array(sight.hidden[0]), none
+        model, pair, work, index, mask, NO_LIMIT, source, array(sight.seen_through[0]), array(sight.hidden[0]), none
     )
     np.testing.assert_allclose(found, eager(view, parameters, *given)[2], rtol=1e-9, atol=1e-9)
     assert labels[7] == -1
-    assert np.isfinite(association.associate(model, pair, work, index, mask, source, none, none, none)[0][mask.all(1)]).all()
+    assert np.isfinite(
+        association.associate(model, pair, work, index, mask, NO_LIMIT, source, none, none, none)[0][mask.all(1)]
+    ).all()
 
 
 def test_without_candidates_everything_is_an_outlier() -> None:
@@ -179,6 +183,8 @@ def test_without_candidates_everything_is_an_outlier() -> None:
     )
     index, mask = np.empty((3, 0), np.int64), np.empty((3, 0), np.bool_)
     model, work = static_features.association_model(layer().fitted), static_features.workspace(3, 0)
-    log_association, labels = association.associate(model, pair, work, index, mask, source, np.zeros(3), np.ones(3), np.zeros(3))
+    log_association, labels = association.associate(
+        model, pair, work, index, mask, NO_LIMIT, source, np.zeros(3), np.ones(3), np.zeros(3)
+    )
     assert log_association.tolist() == [[0.0]] * 3
     assert labels.tolist() == [-1] * 3

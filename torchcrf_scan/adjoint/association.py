@@ -26,10 +26,10 @@ from torchcrf_scan.fast.association import (
     log_pairwise_of,
     log_unary_of,
     outlier_margin,
-    sigmoid,
 )
 from torchcrf_scan.fast.boosting import add_margins
 from torchcrf_scan.fast.free_space import look_slope
+from torchcrf_scan.fast.limit import Limit, sigmoid, slope_within
 from torchcrf_scan.fast.robust import robust_slope, robust_square
 from torchcrf_scan.fast.static_features import (
     AssociationModel,
@@ -87,7 +87,15 @@ def pull_outlier(
 
 @kernel
 def pull_distances(
-    model: AssociationModel, work: Workspace, i: int, distance: Array, nearest: float, margins: Array, slopes: Array, weights: Array
+    model: AssociationModel,
+    work: Workspace,
+    limit: Limit,
+    i: int,
+    distance: Array,
+    nearest: float,
+    margins: Array,
+    slopes: Array,
+    weights: Array,
 ) -> Array:
     """(K,) slopes of the distances of source point i to its candidates; adds those of the weights. slopes: (K+1,)."""
     K = len(distance)
@@ -105,6 +113,8 @@ def pull_distances(
         weights[GATE] -= slope * beyond
         to_distance[k] = slope * w[REGISTERED] * robust_slope(distance[k], model.per_local[REGISTERED])
         to_distance[k] -= slope * w[GATE] * beyond * (1 - beyond) / (model.gate * GATE_WIDTH)
+        if limit.distance > 0:
+            to_distance[k] += slope * slope_within(limit, distance[k])
         if gap <= FARTHEST_EXCESS:
             to_distance[k] -= slope * w[EXCESS] / model.cluster_distance
             to_nearest += slope * w[EXCESS] / model.cluster_distance
@@ -159,7 +169,7 @@ def pull_nodes(
     for i in range(N):
         margins, gaps = boosted[i * K : (i + 1) * K] + work.margin[i], distance[i * K : (i + 1) * K]
         pull_outlier(model, work, i, nearest[i], margins, slopes[i, K], seen_through[i], hidden[i], weights)
-        to_distance = pull_distances(model, work, i, gaps, nearest[i], margins, slopes[i], weights)
+        to_distance = pull_distances(model, work, scene.limit, i, gaps, nearest[i], margins, slopes[i], weights)
         to_seen, to_hidden = slopes[i, K] * w[SEEN_THROUGH], slopes[i, K] * w[HIDDEN]
         to_moved[i, 0], to_moved[i, 1] = look_slope(scene.target_sweep, moved[i, 0], moved[i, 1], to_seen, to_hidden)
         for k in range(K):
@@ -196,7 +206,7 @@ def pull_associate(
     """
     mask = np.full(after.candidates.shape, True)
     update_static(model, scene.descriptors, work, after.candidates, mask)
-    log_unary = log_unary_of(model, scene.descriptors, work, moved, seen_through, hidden)
+    log_unary = log_unary_of(model, scene.descriptors, work, scene.limit, moved, seen_through, hidden)
     for i in range(len(log_unary)):
         log_unary[i, -1] += scene.outlier[i]
     log_pairwise = log_pairwise_of(model, scene.descriptors, after.candidates)

@@ -8,8 +8,16 @@ import numpy as np
 
 from torchcrf_scan.adjoint.motion import add_moved
 from torchcrf_scan.fast.arrays import Scene, State
-from torchcrf_scan.fast.clustering import ClusteringModel, Tables, distance, node_potentials, transition_potentials
+from torchcrf_scan.fast.clustering import (
+    ClusteringModel,
+    Tables,
+    distance,
+    nearest_to_all,
+    node_potentials,
+    transition_potentials,
+)
 from torchcrf_scan.fast.free_space import look, look_slope
+from torchcrf_scan.fast.limit import slope_within
 from torchcrf_scan.fast.robust import robust_slope, robust_square
 from torchcrf_scan.features.scales import GATE_WIDTH
 from torchcrf_scan.loops.jit import Array, Integers, kernel
@@ -66,6 +74,21 @@ def pull_residual(
             to_moved[i, 0] = share * (tables.moved[c, i, 0] - scene.target[j, 0])
             to_moved[i, 1] = share * (tables.moved[c, i, 1] - scene.target[j, 1])
     return to_moved
+
+
+@kernel
+def pull_limit(scene: Scene, moved: Array, nearest: Integers, slopes: Array, to_moved: Array) -> None:
+    """Adds the slopes of (N, 2) points moved by a cluster through the limit of outliers.
+
+    nearest: (N,) their nearest target points. slopes: (N,) of the cluster's potentials.
+    """
+    for i in range(len(slopes)):
+        dx, dy = moved[i, 0] - scene.target[nearest[i], 0], moved[i, 1] - scene.target[nearest[i], 1]
+        gap = distance(dx, dy)
+        if slopes[i] != 0 and gap > 0:
+            share = slopes[i] * slope_within(scene.limit, gap) / gap
+            to_moved[i, 0] += share * dx
+            to_moved[i, 1] += share * dy
 
 
 @kernel
@@ -204,11 +227,15 @@ def pull_cluster(
     of_outlier, of_cluster = nodes[:, P].copy(), np.empty(N)
     pull_outlier(scene, state, tables, states, model.outlier_threshold, of_outlier, weights)
     pull_edges(scene, state, tables, states, model, edges, weights, to_motions)
+    is_limited = scene.limit.distance > 0
+    near = nearest_to_all(scene.boxes, scene.source, state.motions, state.active) if is_limited else nearest
     for s in range(P):
         c = states[s]
         of_cluster[:] = nodes[:, s]
         to_moved = pull_residual(scene, state, tables, nearest[:, c], c, model, of_cluster, weights)
         ahead = of_outlier if c == 0 else of_outlier[:0]
+        if is_limited:
+            pull_limit(scene, tables.moved[c], near[:, c], of_cluster, to_moved)
         pull_ahead(scene, tables.moved[c], model, of_cluster, ahead, to_moved, weights)
         pull_back(scene, state, c, model, of_cluster, weights, to_motions[c])
         for i in range(N):

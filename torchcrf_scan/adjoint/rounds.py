@@ -12,7 +12,7 @@ from torchcrf_scan.adjoint.motion import pull_estimate, pull_partners
 from torchcrf_scan.fast.arrays import Fitted, Scene, Settings, State
 from torchcrf_scan.fast.association import registered_points
 from torchcrf_scan.fast.clustering import nearest_to_outliers
-from torchcrf_scan.fast.rounds import Done, free_space_of, partners_of, tables_of
+from torchcrf_scan.fast.rounds import Done, free_space_of, limit_clusters, partners_of, tables_of
 from torchcrf_scan.fast.static_features import Workspace
 from torchcrf_scan.inference.joint import ROBUST_SHARE
 from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
@@ -144,6 +144,7 @@ def pull_first_pass(scene: Scene, done: Done, slopes: Slopes, inputs: Inputs, st
     """Adds the slopes through the pass over the clustering chain. start: (C, 3) of the motions before the round, added to."""
     before, model = done.before, fitted.clustering
     tables = tables_of(scene, before, model)
+    limit_clusters(scene, before, tables)
     nearest = nearest_to_outliers(scene.boxes, scene.source, before.motions, before.active, before.association)
     given = inputs.clustering, inputs.outlier, inputs.moving
     pull_cluster(scene, before, tables, nearest, done.after.log_cluster, model, slopes.log_cluster, *given, start)

@@ -23,13 +23,23 @@ Item = TypeVar("Item")
 BATCH = 16  # pairs matched at once
 
 
-def load_model(name: str, candidates: int | None = None, device: str = "cpu", threads: int | None = None) -> JointScanCRF:
-    """A saved model on a device; raises ValueError for a damaged one, a missing device or an invalid number of threads."""
+def load_model(
+    name: str,
+    candidates: int | None = None,
+    device: str = "cpu",
+    threads: int | None = None,
+    outlier_distance: float | None = None,
+) -> JointScanCRF:
+    """A saved model on a device; raises ValueError for a damaged one, a missing device or an invalid number of threads.
+
+    candidates, outlier_distance: of `InferenceConfig`; None: as saved.
+    """
     if threads is not None:
         if threads < 1:
             raise ValueError(f"--threads: expected at least 1, got {threads}")
         torch.set_num_threads(threads)
-    changes: dict[str, Any] = {} if candidates is None else {"candidates": candidates}
+    given = {"candidates": candidates, "outlier_distance": outlier_distance}
+    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     try:
         model = JointScanCRF.from_pretrained(name, **changes)
     except ValueError as error:

@@ -58,6 +58,7 @@ def evaluate(
     frame_turn: Turn | None = None,
     seed: int = 0,
     candidates: int | None = None,
+    outlier_distance: float | None = None,
     device: str = "cpu",
     threads: int | None = None,
 ) -> int:
@@ -78,6 +79,8 @@ def evaluate(
         frame_turn: radians by which it is turned, exactly, to a random side; or any, uniform over the whole circle
         seed: seed of the random directions and sides
         candidates: target points considered for each source point, 0 for all; by default as the model was saved
+        outlier_distance: metres; points farther from every target point, under their own motion, are outliers, and no others; by
+            default as the model was saved
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; by default its own choice
     """
@@ -94,7 +97,7 @@ def evaluate(
         name, answers = Path(predictions).resolve().name, _read_predictions(list(pairs), Path(predictions))
     else:
         name = "joint" if method is None else method
-        load = partial(load_model, PRETRAINED if model is None else model, candidates, device, threads)
+        load = partial(load_model, PRETRAINED if model is None else model, candidates, device, threads, outlier_distance)
         answers = _run(name, load, list(pairs.values()), displacement, seed)
     scores = [score_pair(pair, answer) for pair, answer in zip(pairs.values(), answers, strict=True)]
     tables, figures = report(_rows(name, scores)), _figures(name, scores)

@@ -31,6 +31,7 @@ def match(
     no_return: float | None = None,
     model: str = PRETRAINED,
     candidates: int | None = None,
+    outlier_distance: float | None = None,
     device: str = "cpu",
     threads: int | None = None,
 ) -> int:
@@ -49,13 +50,15 @@ def match(
         no_return: readings in metres from there on mean that nothing came back; by default as the log says or shows
         model: folder of a saved model, or the name of one that the package ships
         candidates: target points considered for each source point, 0 for all; by default as the model was saved
+        outlier_distance: metres; points farther from every target point, under their own motion, are outliers, and no others; by
+            default as the model was saved
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; by default its own choice
     """
     failures: list[str] = []
     places = find_pairs(files, every, failures, ReadOptions(topic, odometry, no_return))
     targets = {place.name: _prediction_path(place.name, Path(output)) for place in places}
-    network = load_model(model, candidates, device, threads)
+    network = load_model(model, candidates, device, threads, outlier_distance)
     make_folder("--output", output)
     moving: list[tuple[int, int]] = []
     with tqdm(total=len(places), unit="pair", disable=None) as bar:

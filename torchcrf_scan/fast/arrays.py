@@ -7,6 +7,7 @@ from typing import NamedTuple
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.fast.clustering import ClusteringModel, clustering_model
 from torchcrf_scan.fast.free_space import Sweep
+from torchcrf_scan.fast.limit import Limit
 from torchcrf_scan.fast.motion import METRICS
 from torchcrf_scan.fast.selection import Worth, worth_of
 from torchcrf_scan.fast.static_features import AssociationModel, AssociationPair, association_model
@@ -36,6 +37,7 @@ class Settings(NamedTuple):
 
     Attributes:
         is_soft: motions are fitted to beliefs, not to labels. detaches: no gradient passes through motions to features.
+        outlier_distance: metres; 0: as learned.
     """
 
     candidates: int
@@ -51,6 +53,7 @@ class Settings(NamedTuple):
     wrap_closed: bool
     is_metre: bool
     is_reach_hard: bool
+    outlier_distance: float
 
 
 class Decoded(NamedTuple):
@@ -85,6 +88,7 @@ class Scene(NamedTuple):
         factor: units in a metre. source: (N, 2), target: (M, 2). noise: of a return.
         tangents: (M, 2) of the target. reach: (N, C) of `Start`; inf where `features.reach` hard rules a cluster out.
         outlier, moving: (N,) log potentials of `features.learned.ExtraLogUnary`.
+        limit: of outliers.
     """
 
     factor: float
@@ -99,6 +103,7 @@ class Scene(NamedTuple):
     reach: Array
     outlier: Array
     moving: Array
+    limit: Limit
 
 
 class State(NamedTuple):
@@ -149,4 +154,5 @@ def settings_of(model: ModelConfig) -> Settings:
         features.wrap_closed,
         features.length_unit == "metre",
         features.reach == "hard",
+        config.outlier_distance or 0.0,
     )

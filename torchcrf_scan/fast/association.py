@@ -10,12 +10,13 @@ import math
 import numpy as np
 
 from torchcrf_scan.fast.boosting import add_margins, margin
+from torchcrf_scan.fast.limit import Limit, log_within, sigmoid
 from torchcrf_scan.fast.robust import robust_square
 from torchcrf_scan.fast.static_features import AssociationModel, AssociationPair, Workspace, update_static
 from torchcrf_scan.features.extension import FARTHEST_EXCESS
 from torchcrf_scan.features.scales import GATE_WIDTH, KAPPA
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
-from torchcrf_scan.loops.messages import exp_below, log_softmax, max_marginals
+from torchcrf_scan.loops.messages import log_softmax, max_marginals
 from torchcrf_scan.loops.rigid import transform, transform_of
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, LOCAL_CHANNELS, STATIC_CHANNELS
 
@@ -29,13 +30,6 @@ DATA_BOOSTING, OUTLIER_BOOSTING, EXCESS, GATE, OUTLIER_BIAS, SEEN_THROUGH, HIDDE
         *("sequence", "pairwise_outlier", "pairwise_distance", "pairwise_translation"),
     )
 )
-
-
-@kernel
-def sigmoid(x: float) -> float:
-    """1 / (1 + exp(-x))."""
-    below = exp_below(-abs(x))
-    return (1.0 if x > 0 else below) / (1 + below)
 
 
 @kernel
@@ -75,11 +69,12 @@ def outlier_margin(model: AssociationModel, work: Workspace, i: int, registered:
 
 @kernel
 def log_unary_of(
-    model: AssociationModel, pair: AssociationPair, work: Workspace, moved: Array, seen_through: Array, hidden: Array
+    model: AssociationModel, pair: AssociationPair, work: Workspace, limit: Limit, moved: Array, seen_through: Array, hidden: Array
 ) -> Array:
     """(N, K+1) log potentials of the workspace's candidates and, last, of the outlier.
 
-    moved: (N, 2) source points under their own motion; seen_through, hidden: (N,) their free-space tests in the target.
+    limit: of outliers. moved: (N, 2) source points under their own motion; seen_through, hidden: (N,) their free-space tests in the
+    target.
     """
     N, K = work.candidates.shape
     weights = model.weights
@@ -91,6 +86,9 @@ def log_unary_of(
     if weights[GATE] != 0:
         for p in range(N * K):
             values[p] -= weights[GATE] * sigmoid((distance[p] / model.gate - 1) / GATE_WIDTH)
+    if limit.distance > 0:
+        for p in range(N * K):
+            values[p] += log_within(limit, distance[p])
     constant = weights[OUTLIER_BIAS]
     for c in range(len(LOCAL_CHANNELS)):
         constant += weights[c] * model.local_outlier[c]
@@ -234,6 +232,7 @@ def associate(
     work: Workspace,
     index: Integers,
     mask: Booleans,
+    limit: Limit,
     moved: Array,
     seen_through: Array,
     hidden: Array,
@@ -243,7 +242,7 @@ def associate(
 
     Args:
         work: of the same N and K; the same one for all rounds of a pair.
-        index, mask: (N, K) candidates, real ones first and ascending.
+        index, mask: (N, K) candidates, real ones first and ascending. limit: of outliers.
         moved: (N, 2) source points under their own motion. seen_through, hidden: (N,) their free-space tests in the target.
         extra: (N,) learned log potential of the outlier.
 
@@ -251,7 +250,7 @@ def associate(
         (N, K+1) log-beliefs, the outlier last, and (N,) labels: target point or -1.
     """
     update_static(model, pair, work, index, mask)
-    log_unary = log_unary_of(model, pair, work, moved, seen_through, hidden)
+    log_unary = log_unary_of(model, pair, work, limit, moved, seen_through, hidden)
     for i in range(len(extra)):
         log_unary[i, -1] += extra[i]
     if model.weights[STRETCH] == 0 and model.weights[SHIFT] == 0:

@@ -122,6 +122,12 @@ def nearest_to_outliers(boxes: Boxes, source: Array, motions: Array, active: Boo
 
 
 @kernel
+def nearest_to_all(boxes: Boxes, source: Array, motions: Array, active: Booleans) -> Integers:
+    """(N, C) nearest target point of every point under every active motion; 0 elsewhere. See `nearest_to_outliers`."""
+    return nearest_to_outliers(boxes, source, motions, active, np.full(len(source), -1))
+
+
+@kernel
 def edge_potentials(source: Array, target: Array, association: Integers, model: ClusteringModel) -> tuple[Array, Array, Array]:
     """`length`, `same` and `different` of `Tables`. source: (N, 2); target: (M, 2); association: (N,)."""
     E = max(len(source) - 1, 0)

@@ -13,9 +13,11 @@ import numpy as np
 from torchcrf_scan.fast.arrays import Decoded, Fitted, Scene, Settings, State
 from torchcrf_scan.fast.free_space import sweep_of
 from torchcrf_scan.fast.kept_candidates import kept_of
+from torchcrf_scan.fast.limit import Limit
 from torchcrf_scan.fast.rounds import advance, label_nearest
 from torchcrf_scan.fast.static_features import association_pair, workspace
 from torchcrf_scan.fast.uncertainty import association_confidence, cluster_confidence, motion_covariance
+from torchcrf_scan.features.limit import SOFTNESS
 from torchcrf_scan.features.potentials import REFERENCE_UNIT
 from torchcrf_scan.inference.joint import MERGE_ROTATION, ROBUST_SHARE
 from torchcrf_scan.loops.candidates import by_motion, with_targets
@@ -59,7 +61,9 @@ def limited(reach: Array) -> Array:
 @entry
 def scene_of(pair: Pair, start: PairStart, outlier: Array, moving: Array, settings: Settings) -> Scene:
     """The pair in the unit of the features, with its descriptors. outlier, moving: (N,) as in `Scene`."""
-    factor = 1.0 if settings.is_metre else REFERENCE_UNIT / resolution(pair.source, pair.target, pair.noise)
+    unit = 1.0 if settings.is_metre and settings.outlier_distance == 0 else resolution(pair.source, pair.target, pair.noise)
+    factor = 1.0 if settings.is_metre else REFERENCE_UNIT / unit
+    limit = Limit(settings.outlier_distance * factor, SOFTNESS * unit * factor)
     source, target, noise = scaled(pair.source, factor), scaled(pair.target, factor), pair.noise * factor
     guess, origin = pair.initial_motion.copy(), pair.target_origin.copy()
     for axis in range(2):
@@ -72,7 +76,7 @@ def scene_of(pair: Pair, start: PairStart, outlier: Array, moving: Array, settin
     boxes = boxes_of(target)
     reach = limited(start.reach) if settings.is_reach_hard else start.reach
     given = start.target_tangents, reach, outlier, moving
-    return Scene(factor, source, target, noise, boxes, source_sweep, target_sweep, descriptors, *given)
+    return Scene(factor, source, target, noise, boxes, source_sweep, target_sweep, descriptors, *given, limit)
 
 
 @entry

@@ -9,9 +9,10 @@ import numpy as np
 
 from torchcrf_scan.fast.arrays import Fitted, Scene, Settings, State
 from torchcrf_scan.fast.association import associate, registered_points
-from torchcrf_scan.fast.clustering import ClusteringModel, Tables, cluster, nearest_to_outliers, tabulate
+from torchcrf_scan.fast.clustering import ClusteringModel, Tables, cluster, distance, nearest_to_all, nearest_to_outliers, tabulate
 from torchcrf_scan.fast.free_space import Sweep, look
 from torchcrf_scan.fast.kept_candidates import Kept, kept_of, update
+from torchcrf_scan.fast.limit import log_within
 from torchcrf_scan.fast.motion import Partners, count_points, estimate, retire_empty, soft_partners
 from torchcrf_scan.fast.selection import discard_vacuous
 from torchcrf_scan.fast.static_features import Workspace, workspace
@@ -63,6 +64,20 @@ def tables_of(scene: Scene, state: State, model: ClusteringModel) -> Tables:
         for c in range(1, len(state.motions)):
             tables.log_inlier[c, i] += scene.moving[i]
     return tables
+
+
+@kernel
+def limit_clusters(scene: Scene, state: State, tables: Tables) -> None:
+    """Adds the potential of the limit of outliers to those of the clusters, in place, if there is one. tables: at the state."""
+    if scene.limit.distance == 0:
+        return
+    nearest = nearest_to_all(scene.boxes, scene.source, state.motions, state.active)
+    for c in range(len(state.motions)):
+        if state.active[c]:
+            for i in range(len(scene.source)):
+                j = nearest[i, c]
+                dx, dy = tables.moved[c, i, 0] - scene.target[j, 0], tables.moved[c, i, 1] - scene.target[j, 1]
+                tables.log_inlier[c, i] += log_within(scene.limit, distance(dx, dy))
 
 
 @kernel
@@ -146,7 +161,7 @@ def step(
     moved = registered_points(scene.source, between, state.active, log_cluster)
     seen_through, hidden = free_space_of(scene.target_sweep, moved)
     log_association, association = associate(
-        fitted.association, scene.descriptors, work, index, mask, moved, seen_through, hidden, scene.outlier
+        fitted.association, scene.descriptors, work, index, mask, scene.limit, moved, seen_through, hidden, scene.outlier
     )
     active, empty_for = state.active.copy(), state.empty_for.copy()
     after = State(between.copy(), active, empty_for, association, labels, index, log_association, log_cluster)
@@ -183,6 +198,7 @@ def advance(
         state.cluster[:] = nearest_clusters(tables, scene.reach, state.association)
     if done < SELECTION_ROUNDS and not is_chosen:
         discard_vacuous(tables, state.active, log_odds, fitted.clustering, fitted.worth)
+    limit_clusters(scene, state, tables)  # after the selection, which compares clusters
     after, between = step(scene, state, tables, kept, work, fitted, settings)
     is_damped = settings.stop_early and swings(after, state, older)
     if is_damped:

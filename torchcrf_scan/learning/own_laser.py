@@ -1,0 +1,223 @@
+"""Fits a saved model to one laser on a few annotated pairs: distance of outliers, scales, movers' worth, confidences.
+
+Few pairs must not make a model worse. Every part is fitted on some of the pairs and measured on those left out, in turn, at
+several shares of the way from the model's own values to the fitted ones; it is kept, at the best share, only where the pairs left
+out gain by more than one standard error. The parts are fitted one after the other, each on the model with those before it.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+
+from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.evaluation.calibration import rightness
+from torchcrf_scan.inference.pseudo_likelihood import true_plugins
+from torchcrf_scan.inference.state import ClusterPotential
+from torchcrf_scan.inference.uncertainty import WITHIN
+from torchcrf_scan.learning.calibration_fit import Judged, fit_confidence, judge
+from torchcrf_scan.learning.material import Material
+from torchcrf_scan.learning.scales_fit import fit_scales
+from torchcrf_scan.learning.selection_fit import fit_potential
+from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.scan import Floats, ScanPair
+
+FOLDS = 5  # at most
+SHARES = (0.25, 0.5, 1.0)  # of the way to the fitted values
+DISTANCES = tuple(0.02 * 1.2**k for k in range(28))  # metres, up to 2.7
+AGAIN = (0.25, 0.5, 0.25)  # weights of a distance's errors and its neighbours': one pair must not pick a lucky one
+IN_LOGARITHMS = ("local", "pairwise", "cluster_distance", "outlier_threshold", "gate", "neighbour_weight", "neighbour_distance")
+
+Fit = Callable[[JointScanCRF, Sequence[ScanPair]], nn.Module | None]  # a part's fitted values; None: too little to fit on
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What the pairs left out say of one part of the calibration.
+
+    Attributes:
+        name: of the part. measure: what `before` and `after` are sums of, over all pairs, each left out once.
+        value: the fitted values in words. is_kept: whether the model has them now.
+    """
+
+    name: str
+    measure: str
+    before: float
+    after: float
+    value: str
+    is_kept: bool
+
+
+def calibrate_on(model: JointScanCRF, pairs: Sequence[ScanPair]) -> tuple[JointScanCRF, list[Part]]:
+    """The model fitted to the laser of annotated pairs, and what each part gains on pairs left out.
+
+    Raises:
+        ValueError: fewer than two pairs, one without annotation, or a model of one chain.
+    """
+    if len(pairs) < 2 or any(pair.annotation is None for pair in pairs):
+        raise ValueError(f"pairs: expected two or more annotated pairs, got {len(pairs)}, or one without annotation")
+    if not (model.config.has_association and model.config.has_clusters):
+        raise ValueError(f"chains: expected joint for a model to calibrate, got {model.config.chains}")
+    folds = folds_of(pairs)
+    found = []
+    for fit in (fit_distance, fit_own_scales, fit_worth, fit_confidences):
+        model, part = fit(model, pairs, folds)
+        found.append(part)
+    return model, found
+
+
+def folds_of(pairs: Sequence[ScanPair]) -> list[list[int]]:
+    """The pairs in up to five parts left out in turn: whole sequences if there are that many, else neighbours together."""
+    sequences = sorted({pair.sequence for pair in pairs})
+    if len(sequences) >= FOLDS:
+        return [[k for k, pair in enumerate(pairs) if sequences.index(pair.sequence) % FOLDS == fold] for fold in range(FOLDS)]
+    return [part.tolist() for part in np.array_split(np.arange(len(pairs)), min(FOLDS, len(pairs)))]
+
+
+@torch.no_grad()
+def wrong_points(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
+    """(P,) annotated points of every pair whose association is more than two beams off or whose cluster is wrong."""
+    wrong = []
+    for pair, answer in zip(pairs, model.match_pairs(pairs), strict=True):
+        right = rightness(pair, answer, WITHIN)
+        wrong.append(float((right.known & ~(right.within & right.cluster)).sum()))
+    return np.array(wrong)
+
+
+def gains(before: Floats, after: Floats) -> bool:
+    """Whether the sum over pairs (P,) falls by more than its standard error."""
+    change = before - after
+    return bool(change.sum() > change.std() * len(change) ** 0.5 and change.sum() > 0)
+
+
+def with_distance(model: JointScanCRF, metres: float) -> JointScanCRF:
+    """A copy of the model with this distance of outliers."""
+    other = copy.copy(model)
+    other.config = model.config.with_limit(metres)
+    return other
+
+
+def fit_distance(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
+    """The distance of outliers with the fewest wrong points."""
+    before = wrong_points(model, pairs)
+    tried = np.stack([wrong_points(with_distance(model, metres), pairs) for metres in DISTANCES])  # (distances, P)
+
+    def best(rows: Sequence[int]) -> int:
+        padded = np.pad(tried[:, rows].sum(1), 1, mode="edge")
+        return int(np.convolve(padded, AGAIN, mode="valid").argmin())
+
+    every = range(len(pairs))
+    after = before.copy()
+    for fold in folds:
+        after[fold] = tried[best([k for k in every if k not in fold]), fold]
+    metres = DISTANCES[best(every)]
+    is_kept = gains(before, after)
+    part = Part("outlier distance", "wrong points", before.sum(), after.sum(), f"{metres:.2f} m", is_kept)
+    return (with_distance(model, metres) if is_kept else model), part
+
+
+def fit_own_scales(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
+    """The features' scales by `scales_fit`."""
+
+    def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> nn.Module | None:
+        view = of.view(ScanPairBatch.collate(some))
+        plugins = true_plugins(view.batch, of.config.motions)
+        has_pairs = view.batch.truth is not None and bool((view.batch.truth.association >= 0).any())
+        return fit_scales([view], [plugins]) if has_pairs else None
+
+    return fit_by_share(model, pairs, folds, "scales", "scales", fit)
+
+
+def fit_worth(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
+    """The movers' worth by `selection_fit`."""
+
+    def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> nn.Module | None:
+        batch = ScanPairBatch.collate(some)
+        start = of.initialise(batch.without_truth())
+        if start.log_odds is None:
+            return None
+        found = fit_potential(of, [Material(batch, start, 0, tuple(some))])
+        default = ClusterPotential().state_dict()
+        is_fitted = any(not torch.equal(value, default[name]) for name, value in found.state_dict().items())
+        return found if is_fitted else None
+
+    return fit_by_share(model, pairs, folds, "movers' worth", "cluster_potential", fit)
+
+
+def fit_by_share(
+    model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]], name: str, module: str, fit: Fit
+) -> tuple[JointScanCRF, Part]:
+    """A module of the model fitted on all pairs, at the share of the way that leaves the fewest wrong points on those left out."""
+    before = wrong_points(model, pairs)
+    after = np.tile(before, (len(SHARES), 1))
+    for fold in folds:
+        fitted = fit(model, [pair for k, pair in enumerate(pairs) if k not in fold])
+        for row, share in enumerate(SHARES if fitted is not None else ()):
+            after[row, fold] = wrong_points(moved_towards(model, module, fitted, share), [pairs[k] for k in fold])
+    best = int(after.sum(1).argmin())
+    fitted = fit(model, pairs)
+    is_kept = fitted is not None and gains(before, after[best])
+    part = Part(name, "wrong points", before.sum(), after[best].sum(), f"{100 * SHARES[best]:.0f} % of the way", is_kept)
+    return (moved_towards(model, module, fitted, SHARES[best]) if is_kept else model), part
+
+
+@torch.no_grad()
+def moved_towards(model: JointScanCRF, module: str, fitted: nn.Module | None, share: float) -> JointScanCRF:
+    """A copy of the model with the buffers of a module a share of the way to the fitted ones; scales in logarithms."""
+    assert fitted is not None
+    other = copy.deepcopy(model)
+    values = fitted.state_dict()
+    for name, own in getattr(other, module).named_buffers():
+        target = values[name].to(own)
+        if module == "scales" and name in IN_LOGARITHMS:
+            own.copy_((own.log() * (1 - share) + target.log() * share).exp())
+        else:
+            own.copy_(own * (1 - share) + target * share)
+    return other
+
+
+@torch.no_grad()
+def fit_confidences(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
+    """Slopes and offsets of both confidences by `calibration_fit`, at the share of the way with the least surprise left out."""
+    judged = [judge([pair], model(ScanPairBatch.collate([pair]).without_truth())) for pair in pairs]
+    own = np.stack([of.double().cpu().numpy() for of in (model.calibration.association, model.calibration.cluster)])  # (2, 2)
+    before = np.array([surprise(of, own) for of in judged])
+    after = np.tile(before, (len(SHARES), 1))
+    for fold in folds:
+        fitted = slopes_of([of for k, of in enumerate(judged) if k not in fold])
+        for row, share in enumerate(SHARES if fitted is not None else ()):
+            after[row, fold] = [surprise(judged[k], own + share * (fitted - own)) for k in fold]
+    best = int(after.sum(1).argmin())
+    fitted = slopes_of(judged)
+    is_kept = fitted is not None and gains(before, after[best])
+    part = Part("confidences", "nats", before.sum(), after[best].sum(), f"{100 * SHARES[best]:.0f} % of the way", is_kept)
+    if not is_kept or fitted is None:
+        return model, part
+    other, values = copy.deepcopy(model), torch.from_numpy(own + SHARES[best] * (fitted - own))
+    other.calibration.association.copy_(values[0])
+    other.calibration.cluster.copy_(values[1])
+    return other, part
+
+
+def slopes_of(judged: Sequence[Judged]) -> Floats | None:
+    """(2, 2) slope and offset of the association's and the cluster's confidence; None without an annotated point."""
+    every = Judged.joined(judged)
+    if not len(every.association_right):
+        return None
+    association = fit_confidence(every.association_log_odds, every.association_right)
+    return np.stack([association, fit_confidence(every.cluster_log_odds, every.cluster_right)])
+
+
+def surprise(judged: Judged, slopes: Floats) -> float:
+    """Negative log-likelihood of the labels' rightness by the confidences, nats in all points. slopes: (2, 2)."""
+    total = 0.0
+    chains = (judged.association_log_odds, judged.association_right), (judged.cluster_log_odds, judged.cluster_right)
+    for (log_odds, right), (slope, offset) in zip(chains, slopes, strict=True):
+        score = slope * log_odds + offset
+        total += float(np.logaddexp(0, np.where(right, -score, score)).sum())
+    return total
