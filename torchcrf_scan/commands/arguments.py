@@ -38,12 +38,15 @@ def load_model(
         if threads < 1:
             raise ValueError(f"--threads: expected at least 1, got {threads}")
         torch.set_num_threads(threads)
-    given = {"candidates": candidates, "outlier_distance": outlier_distance}
-    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    changes: dict[str, Any] = {} if candidates is None else {"candidates": candidates}
     try:
         model = JointScanCRF.from_pretrained(name, **changes)
     except ValueError as error:
         raise ValueError(f"--model {name}: {error}") from error
+    try:
+        model.config = model.config.with_limit(outlier_distance)
+    except ValueError as error:
+        raise ValueError(f"--{error}") from error
     try:
         return model.to(device)
     except (RuntimeError, AssertionError) as error:

@@ -79,14 +79,21 @@ def folds_of(pairs: Sequence[ScanPair]) -> list[list[int]]:
     return [part.tolist() for part in np.array_split(np.arange(len(pairs)), min(FOLDS, len(pairs)))]
 
 
-@torch.no_grad()
 def wrong_points(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
     """(P,) annotated points of every pair whose association is more than two beams off or whose cluster is wrong."""
-    wrong = []
+    return errors(model, pairs)[:, 0]
+
+
+@torch.no_grad()
+def errors(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
+    """(P, 2) `wrong_points`, and the points wrongly called outliers or not, of every pair."""
+    found = []
     for pair, answer in zip(pairs, model.match_pairs(pairs), strict=True):
-        right = rightness(pair, answer, WITHIN)
-        wrong.append(float((right.known & ~(right.within & right.cluster)).sum()))
-    return np.array(wrong)
+        assert pair.annotation is not None
+        right, beam = rightness(pair, answer, WITHIN), pair.source.beam
+        is_confused = (pair.annotation.association[beam] < 0) != (answer.association[beam] < 0)
+        found.append([(right.known & ~(right.within & right.cluster)).sum(), (right.known & is_confused).sum()])
+    return np.array(found, dtype=np.float64)
 
 
 def gains(before: Floats, after: Floats) -> bool:
@@ -103,12 +110,12 @@ def with_distance(model: JointScanCRF, metres: float) -> JointScanCRF:
 
 
 def fit_distance(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
-    """The distance of outliers with the fewest wrong points."""
-    before = wrong_points(model, pairs)
-    tried = np.stack([wrong_points(with_distance(model, metres), pairs) for metres in DISTANCES])  # (distances, P)
+    """The distance with the fewest errors about outliers, if there are no more wrong points with it."""
+    before = errors(model, pairs)
+    tried = np.stack([errors(with_distance(model, metres), pairs) for metres in DISTANCES])  # (distances, P, 2)
 
     def best(rows: Sequence[int]) -> int:
-        padded = np.pad(tried[:, rows].sum(1), 1, mode="edge")
+        padded = np.pad(tried[:, rows, 1].sum(1), 1, mode="edge")
         return int(np.convolve(padded, AGAIN, mode="valid").argmin())
 
     every = range(len(pairs))
@@ -116,8 +123,8 @@ def fit_distance(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence
     for fold in folds:
         after[fold] = tried[best([k for k in every if k not in fold]), fold]
     metres = DISTANCES[best(every)]
-    is_kept = gains(before, after)
-    part = Part("outlier distance", "wrong points", before.sum(), after.sum(), f"{metres:.2f} m", is_kept)
+    is_kept = gains(before[:, 1], after[:, 1]) and after[:, 0].sum() <= before[:, 0].sum()
+    part = Part("outlier distance", "outlier errors", before[:, 1].sum(), after[:, 1].sum(), f"{metres:.2f} m", is_kept)
     return (with_distance(model, metres) if is_kept else model), part
 
 

@@ -1,0 +1,118 @@
+"""Calibration on one's own laser: what is fitted, what is kept, and that few pairs do no harm."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from torchcrf_scan import JointScanCRF
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.learning import own_laser
+from torchcrf_scan.learning.own_laser import calibrate_on, folds_of, gains, moved_towards, surprise, wrong_points
+from torchcrf_scan.scan import OUTLIER, ScanPair
+
+GATE = 0.1  # metres: the convention of the annotation made up here
+
+
+@cache
+def shipped() -> JointScanCRF:
+    return JointScanCRF.from_pretrained("simulated")
+
+
+@cache
+def annotated(count: int = 6) -> list[ScanPair]:
+    """Simulated pairs whose annotation calls a point an outlier that is farther than `GATE` from all targets of its body."""
+    made = simulate_pairs(SimulatorConfig(beams=91, movers_min=1), count, 1, 11)
+    return [with_gate(pair) for pair in made]
+
+
+def with_gate(pair: ScanPair) -> ScanPair:
+    truth = pair.annotation
+    assert truth is not None
+    association, cluster = np.full(pair.source.n_beams, OUTLIER), np.full(pair.source.n_beams, OUTLIER)
+    for beam, point in zip(pair.source.beam, pair.source.points, strict=True):
+        body = int(truth.body[beam])
+        theta, x, y = truth.motions[max(body, 0)]
+        turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+        distance = np.linalg.norm(pair.target.points - (turn @ point + np.array([x, y])), axis=1)
+        if body >= 0 and distance.min() < GATE:
+            association[beam], cluster[beam] = pair.target.beam[distance.argmin()], body
+    return replace(pair, annotation=replace(truth, association=association, cluster=cluster))
+
+
+def test_the_annotation_s_convention_is_found_and_kept() -> None:
+    fitted, parts = calibrate_on(shipped(), annotated())
+    by_name = {part.name: part for part in parts}
+    assert list(by_name) == ["outlier distance", "scales", "movers' worth", "confidences"]
+    assert by_name["outlier distance"].is_kept
+    assert fitted.config.inference.outlier_distance == pytest.approx(GATE, rel=0.3)
+    assert wrong_points(fitted, annotated()).sum() < wrong_points(shipped(), annotated()).sum()
+
+
+def test_what_is_kept_gains_and_the_model_given_is_unchanged() -> None:
+    model = JointScanCRF.from_pretrained("simulated")
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    fitted, parts = calibrate_on(model, annotated(3))
+    assert all(part.after < part.before for part in parts if part.is_kept)
+    assert model.config == shipped().config
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, before[name]), name
+    if not any(part.is_kept for part in parts[1:3]):
+        assert torch.equal(fitted.scales.local, model.scales.local)
+
+
+def test_a_saved_calibration_is_used_by_default(tmp_path: object) -> None:
+    fitted, _ = calibrate_on(shipped(), annotated())
+    fitted.save_pretrained(str(tmp_path))
+    loaded = JointScanCRF.from_pretrained(str(tmp_path))
+    assert loaded.config.inference.outlier_distance == fitted.config.inference.outlier_distance
+    np.testing.assert_array_equal(wrong_points(loaded, annotated()), wrong_points(fitted, annotated()))
+
+
+def test_folds_leave_every_pair_out_once() -> None:
+    pairs = annotated()
+    for some in (pairs, pairs[:2], [replace(pair, sequence=str(k)) for k, pair in enumerate(pairs)]):
+        assert sorted(k for fold in folds_of(some) for k in fold) == [*range(len(some))]
+        assert all(len(fold) < len(some) for fold in folds_of(some))
+
+
+def test_a_gain_must_exceed_its_standard_error() -> None:
+    assert gains(np.array([9.0, 8.0, 9.0]), np.array([5.0, 5.0, 5.0]))
+    assert not gains(np.array([30.0, 5.0, 5.0]), np.array([5.0, 9.0, 9.0]))
+    assert not gains(np.array([5.0, 5.0]), np.array([5.0, 5.0]))
+
+
+def test_shares_lead_from_the_model_s_values_to_the_fitted_ones() -> None:
+    fitted = JointScanCRF().scales
+    for share in (0.0, 1.0):
+        moved = moved_towards(shipped(), "scales", fitted, share).scales.state_dict()
+        expected = (fitted if share else shipped().scales).state_dict()
+        for name, value in moved.items():
+            torch.testing.assert_close(value, expected[name].to(value))
+
+
+def test_a_mover_s_worth_is_fitted_or_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fit(*_: object) -> object:
+        return JointScanCRF().cluster_potential  # the default: too little to fit on
+
+    monkeypatch.setattr(own_laser, "fit_potential", fit)
+    model, part = own_laser.fit_worth(shipped(), annotated(3), folds_of(annotated(3)))
+    assert not part.is_kept
+    assert part.before == part.after
+    assert model is shipped()
+
+
+def test_surprise_is_the_negative_log_likelihood() -> None:
+    judged = own_laser.Judged(np.array([2.0]), np.array([True]), np.array([True]), np.array([-1.0]), np.array([False]), np.zeros(0))
+    expected = np.log1p(np.exp(-2.0)) + np.log1p(np.exp(-1.0))
+    assert surprise(judged, np.array([[1.0, 0.0], [1.0, 0.0]])) == pytest.approx(expected)
+
+
+def test_what_cannot_be_calibrated_is_refused() -> None:
+    with pytest.raises(ValueError, match="two or more annotated pairs"):
+        calibrate_on(shipped(), annotated()[:1])
+    with pytest.raises(ValueError, match="two or more annotated pairs"):
+        calibrate_on(shipped(), [replace(pair, annotation=None) for pair in annotated()])
