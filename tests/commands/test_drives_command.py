@@ -13,7 +13,7 @@ pytest.importorskip("trackeval", reason="needs trackeval (extra tracking)")
 
 
 def test_a_short_drive_is_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = run("drives", "--worlds", "[cars_240]", "--scans", "12", "--count", "1", "--json", str(tmp_path / "rows.json"))
+    code = run("drives", "--worlds", "cars_240", "--scans", "12", "--count", "1", "--json", str(tmp_path / "rows.json"))
     assert code == 0
     header, line, row = capsys.readouterr().out.splitlines()
     assert header.startswith("| world | movers | found by pairs, % |")
@@ -29,6 +29,8 @@ def test_a_short_drive_is_scored(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ("arguments", "message"),
     [
         (["--worlds", "[street,moon]"], "--worlds: expected some of street, .* got moon"),
+        (["--worlds", "moon"], "--worlds: expected some of street, .* got moon$"),
+        (["--worlds", "[]"], "--worlds: expected some of street, .* got none$"),
         (["--scans", "1"], "--scans: expected at least 2, got 1"),
         (["--count", "0"], "--count: expected at least 1, got 0"),
     ],

@@ -110,6 +110,11 @@ def _each_once(places: Iterable[PairPlace]) -> list[PairPlace]:
     return list(found.values())
 
 
+def listed(values: tuple[str, ...] | str) -> tuple[str, ...]:
+    """The values of an option that takes a list, or one value without brackets."""
+    return (values,) if isinstance(values, str) else values
+
+
 def make_folder(option: str, folder: str | Path) -> Path:
     """Creates the folder if necessary; raises ValueError, with the name of its option, if that fails."""
     try:
