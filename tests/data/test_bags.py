@@ -84,6 +84,14 @@ def test_a_bag_without_scans_tells_what_it_has(tmp_path: Path) -> None:
         next(read_scans(path))
 
 
+@pytest.mark.parametrize("name", ["/odom", "auto"])
+def test_odometry_that_is_not_there_is_told(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path, "ros1", drive(2))
+    expected = r"expected a topic of type nav_msgs/Odometry, got /scan \(sensor_msgs/LaserScan\)$"
+    with pytest.raises(ValueError, match=rf"run\.bag: odometry: {expected}"):
+        next(read_scans(path, odometry=name))
+
+
 # --- messages -----------------------------------------------------------------------------------------------------------------
 
 

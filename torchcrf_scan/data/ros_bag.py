@@ -78,17 +78,13 @@ def _choose_odometry(path: Path, topics: list[Topic], name: str | None) -> Topic
 
 def _choose(path: Path, topics: list[Topic], types: tuple[str, ...], name: str | None, option: str) -> Topic:
     fits = [topic for topic in topics if topic.type in types]
-    if name is not None:
-        chosen = [topic for topic in fits if topic.name.strip("/") == name.strip("/")]
-        if chosen:
-            return chosen[0]
-        raise ValueError(f"{path}: {option}: expected one of {_listed(fits)}, got {name}")
-    if len(fits) == 1:
-        return fits[0]
-    if fits:
-        raise ValueError(f"{path}: {option}: expected which of {_listed(fits)}, got none")
-    wanted = " or ".join(kind.replace("/msg/", "/") for kind in types)
-    raise ValueError(f"{path}: {option}: expected a topic of type {wanted}, got {_listed(topics) or 'none'}")
+    if not fits:
+        wanted = " or ".join(kind.replace("/msg/", "/") for kind in types)
+        raise ValueError(f"{path}: {option}: expected a topic of type {wanted}, got {_listed(topics) or 'none'}")
+    chosen = [topic for topic in fits if name is None or topic.name.strip("/") == name.strip("/")]
+    if len(chosen) == 1:
+        return chosen[0]
+    raise ValueError(f"{path}: {option}: expected {'one' if name else 'which'} of {_listed(fits)}, got {name or 'none'}")
 
 
 def _listed(topics: list[Topic]) -> str:
