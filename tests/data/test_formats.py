@@ -9,6 +9,7 @@ import pytest
 
 from torchcrf_scan.data.carmen import read_carmen
 from torchcrf_scan.data.formats import FORMATS, PAIR, find_format, is_recording, read_recording, read_scans
+from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.scan import Scan, ScanPair
 
@@ -78,6 +79,33 @@ def test_one_scan_makes_no_pair(tmp_path: Path) -> None:
     path.write_text(READING.format(stamp=0.0))
     with pytest.raises(ValueError, match=r"run\.log: expected at least two scans, got one$"):
         read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "options", "name"),
+    [
+        ("stamp,0.0,0.1\n0,1,2\n", {"topic": "/scan"}, "topic"),
+        ("stamp,0.0,0.1\n0,1,2\n", {"odometry": "/odom"}, "odometry"),
+        (CARMEN, {"odometry": "/odom"}, "odometry"),
+    ],
+)
+def test_options_without_meaning_are_refused(tmp_path: Path, content: str, options: dict[str, str], name: str) -> None:
+    path = tmp_path / "run"
+    path.write_text(content)
+    told = rf"run: {name}: expected none, as this is a C[\w ]+, got {options[name]}$"
+    with pytest.raises(ValueError, match=told):
+        read_scans(path, **options)
+    with pytest.raises(ValueError, match=told):
+        read_recording(path, ReadOptions(**options))
+    assert len(list(read_scans(path, odometry="auto", no_return=50.0)))
+
+
+def test_a_pair_file_takes_no_options(tmp_path: Path) -> None:
+    scan = Scan.from_ranges([1.0, 2.0], [0.2, 0.1])
+    write_pair(tmp_path / "pair.npz", ScanPair(scan, scan, 0.25))
+    for options in ({"topic": "/scan"}, {"no_return": 8.0}):
+        with pytest.raises(ValueError, match=r"pair\.npz: \w+: expected none, as this is a pair file, got"):
+            read_scans(tmp_path / "pair.npz", **options)
 
 
 def test_a_pair_file_is_two_scans(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from torchcrf_scan.data import mcap_bag, ros1_bag, ros2_bag
 from torchcrf_scan.data.archive import ZIP
 from torchcrf_scan.data.carmen import read_carmen
 from torchcrf_scan.data.csv_scans import FIRST, read_csv_scans
-from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
+from torchcrf_scan.data.options import AS_RECORDED, AUTO, ReadOptions
 from torchcrf_scan.data.pair_file import read_pair_scans
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.recording import Recording
@@ -31,11 +31,20 @@ class Format:
 
     Attributes:
         name: for messages. fits: whether a file that begins like this (unpacked if it is gzipped) has it. read: its reader.
+        options: of `ReadOptions`, those that it takes beside `on_bad`.
     """
 
     name: str
     fits: Callable[[bytes], bool]
     read: Reader
+    options: tuple[str, ...] = ("topic", "odometry", "no_return")
+
+    def check(self, path: str | Path, options: ReadOptions) -> None:
+        """Raises ValueError for an option that has no meaning in this format; `auto` odometry is what comes with the scans."""
+        for name in ("topic", "odometry", "no_return"):
+            value = getattr(options, name)
+            if name not in self.options and value not in (None, AUTO):
+                raise ValueError(f"{path}: {name}: expected none, as this is a {self.name}, got {value}")
 
 
 def _begins(start: bytes) -> Callable[[bytes], bool]:
@@ -50,15 +59,15 @@ def _is_text(head: bytes) -> bool:
     return head.strip() != b"" and head[0] not in BINARY and min(head) >= ord("\t")
 
 
-PAIR = Format("pair file", _begins(ZIP), read_pair_scans)
+PAIR = Format("pair file", _begins(ZIP), read_pair_scans, ())
 FOLDER = Format("folder of ROS 2", lambda head: False, read_folder_bag)
 FORMATS = (  # the first that fits
     PAIR,
     Format("ROS 1 bag", _begins(ros1_bag.MAGIC), read_ros1_bag),
     Format("MCAP file", _begins(mcap_bag.MAGIC), read_mcap),
     Format("ROS 2 database", _begins(ros2_bag.SQLITE), read_sqlite_bag),
-    Format("CSV of ranges", _is_csv, read_csv_scans),
-    Format("CARMEN log", _is_text, read_carmen),
+    Format("CSV of ranges", _is_csv, read_csv_scans, ("no_return",)),
+    Format("CARMEN log", _is_text, read_carmen, ("topic", "no_return")),
     FOLDER,
 )
 NAMES = ", ".join(form.name for form in FORMATS)
@@ -97,7 +106,8 @@ def read_scans(
             its place.
         OSError: the file cannot be opened.
     """
-    return _reader(path)(Path(path), ReadOptions(topic, odometry, no_return, on_bad))
+    options = ReadOptions(topic, odometry, no_return, on_bad)
+    return _reader(path, options)(Path(path), options)
 
 
 def read_recording(path: str | Path, options: ReadOptions = AS_RECORDED) -> Recording:
@@ -107,11 +117,12 @@ def read_recording(path: str | Path, options: ReadOptions = AS_RECORDED) -> Reco
         ValueError: another format, a file that cannot be read, or fewer than two scans.
         OSError: the file cannot be opened.
     """
-    return Recording(path, partial(_reader(path), Path(path), options))
+    return Recording(path, partial(_reader(path, options), Path(path), options))
 
 
-def _reader(path: str | Path) -> Reader:
+def _reader(path: str | Path, options: ReadOptions) -> Reader:
     form = find_format(path)
     if form is None:
         raise ValueError(f"{path}: expected one of {NAMES}, got none of these")
+    form.check(path, options)
     return form.read

@@ -132,7 +132,7 @@ def write_pair(path: str | Path, pair: ScanPair) -> None:
 def read_pair_scans(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iterator[Reading]:
     """Both scans of a pair file as a recording that begins at 0 s; raises the errors of `read_pair`.
 
-    options: ignored, as a pair file says everything.
+    options: without meaning, as a pair file says everything.
     """
     pair = read_pair(path)
     yield Reading(pair.source, 0.0)
