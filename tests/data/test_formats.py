@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torchcrf_scan.data.carmen import read_carmen
-from torchcrf_scan.data.formats import FORMATS, PAIR, find_format, is_recording, read_recording, read_scans
+from torchcrf_scan.data.formats import FORMATS, find_format, read_recording, read_scans
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.scan import Scan, ScanPair
@@ -34,11 +34,9 @@ def name_of(path: Path) -> str | None:
         (b"\x89MCAP0\r\n\1", "MCAP file"),
         (b"SQLite format 3\0", "ROS 2 database"),
         (b"PK\3\4", "pair file"),
-        (b"", None),
         (b"  \n", None),
         (b"\x93NUMPY\1\0", None),
         (pickle.dumps([1, 2]), None),
-        (b"\x1f\x8b\x08\0", None),
         (bytes(1000), None),
     ],
 )
@@ -47,11 +45,22 @@ def test_a_file_is_known_by_its_content(tmp_path: Path, content: bytes, name: st
     path = tmp_path / file
     path.write_bytes(content)
     assert name_of(path) == name
-    assert is_recording(path) == (name not in (None, PAIR.name))
     if name is None:
         with pytest.raises(ValueError, match=r": expected one of pair file, ROS 1 bag, .*, got none of these$") as error:
             read_scans(path)
         assert "pickle" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"#ROSBAG V2", b"\x89MCAP", b"SQLite format", b"P", b"\x1f\x8b\x08\0", gzip.compress(CARMEN.encode())[:15]]
+)
+def test_a_file_that_ends_before_its_format_is_known(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "run.bag"
+    path.write_bytes(content)
+    got = f"a file that is cut after {len(content)} bytes" if content else "an empty file"
+    assert find_format(path) is None
+    with pytest.raises(ValueError, match=rf"run\.bag: expected one of pair file, .*, got {got}$"):
+        read_scans(path)
 
 
 def test_a_folder_is_known_by_its_metadata(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from torchcrf_scan.data.ros_bag import read_folder_bag, read_mcap, read_ros1_bag
 from torchcrf_scan.data.text_lines import open_unpacked
 
 HEAD = 512  # bytes
+STARTS = (ZIP, ros1_bag.MAGIC, mcap_bag.MAGIC, ros2_bag.SQLITE)
 BINARY = b"\x80\x93"  # first bytes of a pickle and of an array of numpy
 
 Reader = Callable[[Path, ReadOptions], Iterator[Reading]]
@@ -78,17 +79,22 @@ def find_format(path: str | Path) -> Format | None:
     path = Path(path)
     if path.is_dir():
         return FOLDER if ros2_bag.is_folder_bag(path) else None
+    head = _head(path)
+    return None if _is_cut(head) else next((form for form in FORMATS if form.fits(head)), None)
+
+
+def _head(path: Path) -> bytes:
+    """The first bytes of a file, unpacked; none of a packed one that is damaged."""
     with open_unpacked(path) as file:
         try:
-            head = file.read(HEAD)
+            return file.read(HEAD)
         except (EOFError, zlib.error):
-            head = b""
-    return next((form for form in FORMATS if form.fits(head)), None)
+            return b""
 
 
-def is_recording(path: str | Path) -> bool:
-    """Whether a file or folder is a recording, and no pair file nor anything else. Raises OSError if it cannot be read."""
-    return find_format(path) not in (PAIR, None)
+def _is_cut(head: bytes) -> bool:
+    """Whether a file ends within the bytes that tell its format."""
+    return any(len(head) < len(start) and start.startswith(head) for start in STARTS)
 
 
 def read_scans(
@@ -123,6 +129,14 @@ def read_recording(path: str | Path, options: ReadOptions = AS_RECORDED) -> Reco
 def _reader(path: str | Path, options: ReadOptions) -> Reader:
     form = find_format(path)
     if form is None:
-        raise ValueError(f"{path}: expected one of {NAMES}, got none of these")
+        raise ValueError(f"{path}: expected one of {NAMES}, got {_unknown(Path(path))}")
     form.check(path, options)
     return form.read
+
+
+def _unknown(path: Path) -> str:
+    """What a file is that has none of the formats."""
+    if path.is_dir() or not _is_cut(_head(path)):
+        return "none of these"
+    size = path.stat().st_size
+    return f"a file that is cut after {size} bytes" if size else "an empty file"
