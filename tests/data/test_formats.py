@@ -83,6 +83,17 @@ def test_a_recording_has_the_pairs_of_consecutive_scans(tmp_path: Path) -> None:
     assert [reading.stamp for reading in read_scans(path)] == [reading.stamp for reading in read_carmen(path)]
 
 
+def test_a_malformed_line_is_left_out_of_the_pairs_on_request(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, told = tmp_path / "run.log", list[ValueError]()
+    lines = [READING.format(stamp=k / 10) for k in range(4)]
+    path.write_text("".join([*lines[:2], "FLASER 3 1.00 two 1.20\n", *lines[2:]]))
+    recording = read_recording(path, ReadOptions(on_bad=told.append))
+    assert len(list(recording)) == len(list(recording)) == 3
+    assert (len(told), recording.fault, caplog.text) == (1, None, "")
+    assert len(ended := read_recording(path)) == 1
+    assert str(ended.fault) == str(told[0])
+
+
 def test_one_scan_makes_no_pair(tmp_path: Path) -> None:
     path = tmp_path / "run.log"
     path.write_text(READING.format(stamp=0.0))

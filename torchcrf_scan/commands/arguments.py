@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -75,7 +75,7 @@ def find_pairs(patterns: Sequence[str], every: int, failures: list[str], options
     if every < 1:
         raise ValueError(f"--every: expected at least 1, got {every}")
     pair_files = {path for path in paths if attempt([], find_format, path) is PAIR}
-    if len(pair_files) == len(paths) and (every > 1 or options != AS_RECORDED):
+    if len(pair_files) == len(paths) and (every > 1 or replace(options, on_bad=None) != AS_RECORDED):
         every_nth = f"--every: expected a log to take every {every}-th pair of"
         told = every_nth if every > 1 else "--topic, --odometry, --no_return: expected a log to read with them"
         raise ValueError(f"{told}, got pair files alone")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -117,13 +117,18 @@ def read_scans(
 
 
 def read_recording(path: str | Path, options: ReadOptions = AS_RECORDED) -> Recording:
-    """The pairs of consecutive scans of a recording in any format.
+    """The pairs of consecutive scans of a recording in any format; `on_bad` is told once of what is left out.
 
     Raises:
         ValueError: another format, a file that cannot be read, or fewer than two scans.
         OSError: the file cannot be opened.
     """
-    return Recording(path, partial(_reader(path, options), Path(path), options))
+    read, quiet = _reader(path, options), replace(options, on_bad=options.on_bad and _ignore)
+    return Recording(path, partial(read, Path(path), options), partial(read, Path(path), quiet))
+
+
+def _ignore(error: ValueError) -> None:
+    """Of what was told before."""
 
 
 def _reader(path: str | Path, options: ReadOptions) -> Reader:
