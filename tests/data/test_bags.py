@@ -227,6 +227,25 @@ def test_a_message_that_is_cut_is_named(tmp_path: Path) -> None:
     assert f"{path}, row 4: expected a {LASER}, got" in fault
 
 
+@pytest.mark.parametrize("form", ["packed messages", "packed messages mcap"])
+@pytest.mark.parametrize("odometry", [None, "auto"])
+def test_a_damaged_packed_message_is_one_bad_scan(tmp_path: Path, form: str, odometry: str | None) -> None:
+    path, told = write(tmp_path, form, [*drive(9), *(wheels(9) if odometry else [])]), list[ValueError]()
+    (part,) = (file for file in path.iterdir() if file.suffix != ".yaml")
+    data, start = part.read_bytes(), b"\x28\xb5\x2f\xfd"
+    assert data.count(start) >= 9
+    at = [k for k in range(len(data)) if data.startswith(start, k)]
+    large = [k for k, after in zip(at, [*at[1:], len(data)], strict=True) if after - k > 500]
+    part.write_bytes(data[: large[4]] + bytes(16) + data[large[4] + 16 :])
+    readings = list(read_scans(path, odometry=odometry, on_bad=told.append))
+    assert len(readings) == 8
+    (error,) = told
+    assert f"{part}, r" in str(error)
+    assert "expected data that can be unpacked" in str(error)
+    with pytest.raises(ValueError, match="expected data that can be unpacked"):
+        list(read_scans(path, odometry=odometry))
+
+
 def test_folders_with_wrong_metadata(tmp_path: Path) -> None:
     path = write(tmp_path, "sqlite", drive(2))
     next(file for file in path.iterdir() if file.suffix == ".db3").rename(path / "other.db3")

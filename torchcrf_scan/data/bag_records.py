@@ -38,12 +38,13 @@ def type_name(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message. stamp: seconds, when it was recorded. where: file and place, for errors."""
+    """A message. stamp: seconds, when it was recorded. where: file and place, for errors. is_packed: by zstd."""
 
     topic: Topic
     stamp: float
     data: bytes
     where: str
+    is_packed: bool = False
 
 
 class Bag(Protocol):

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchcrf_scan.data.bag_records import Bag, Message, Topic
+from torchcrf_scan.data.bag_records import Bag, Message, Topic, unpack_message
 from torchcrf_scan.data.mcap_bag import McapBag
 from torchcrf_scan.data.options import AS_RECORDED, AUTO, ReadOptions
 from torchcrf_scan.data.reading import Reading
@@ -101,9 +101,9 @@ class _Reader:
     def decode(self, message: Message) -> Any:
         """The message as an object; raises ValueError with its place."""
         try:
-            if message.topic.is_cdr:
-                return self._store.deserialize_cdr(message.data, message.topic.type)
-            return self._store.deserialize_ros1(message.data, message.topic.type)
+            data = unpack_message(message.data) if message.is_packed else message.data
+            deserialize = self._store.deserialize_cdr if message.topic.is_cdr else self._store.deserialize_ros1
+            return deserialize(data, message.topic.type)
         except Exception as error:  # a library's, of damaged bytes
             raise ValueError(f"{message.where}: expected a {message.topic.type}, got {type(error).__name__}: {error}") from error
 
