@@ -12,6 +12,7 @@ from torchcrf_scan.result import ScanResult, Status
 from torchcrf_scan.scan import BACKGROUND, Floats
 from torchcrf_scan.viz.frames import STATUS_COLORS
 from torchcrf_scan.viz.history import STATUSES, Path, StaticMap, Tally, TrackPaths, travelled
+from torchcrf_scan.viz.lettering import drawable
 from torchcrf_scan.viz.marks import INK, NOTE, mover_look
 from torchcrf_scan.viz.scene import Window
 
@@ -60,7 +61,7 @@ class Summary:
         bottoms = (BOTTOM + 2 * (GAP + STRIP), BOTTOM + GAP + STRIP, BOTTOM)
         boxes = [np.array([LEFT, bottom, WIDTH, tall]) / size for bottom, tall in zip(bottoms, (height, STRIP, STRIP), strict=True)]
         plane, speed, objects = (figure.add_axes(tuple(box)) for box in boxes)
-        figure.text(LEFT / size[0], 1 - 0.32 / size[1], name, fontsize=15, fontweight="bold", color=INK, parse_math=False)
+        figure.text(LEFT / size[0], 1 - 0.32 / size[1], drawable(name), fontsize=15, fontweight="bold", color=INK, parse_math=False)
         figure.text(LEFT / size[0], 1 - 0.58 / size[1], self.tally.describe(), fontsize=9.5, color=NOTE)
         self._draw_plane(plane, low, high)
         self._draw_speed(speed)
