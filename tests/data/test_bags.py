@@ -2,6 +2,7 @@
 
 import sqlite3
 import struct
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -282,6 +283,17 @@ def test_a_chunk_that_is_larger_than_it_says_is_refused(compression: str) -> Non
         bag_records.unpack(b"nothing of the kind", compression, 1000)
     with pytest.raises(ValueError, match="expected compression by bz2, lz4, zstd or none, got 'zip'"):
         bag_records.unpack(packed, "zip", 1000)
+
+
+@pytest.mark.parametrize(("form", "library"), [("ros1 lz4", "lz4"), ("packed messages", "backports"), ("mcap", "rosbags")])
+def test_a_library_that_is_missing_is_named(tmp_path: Path, form: str, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path, form, drive(2))
+    for name in [name for name in sys.modules if name.split(".")[0] in (library, "compression")]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in (library, "compression"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ValueError, match=rf"expected the library {library}.* \(extra `ros`\), got"):
+        list(read_scans(path))
 
 
 def zstd_of(data: bytes) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,7 +29,11 @@ Write = Callable[[Image], None]
 
 def can_write_mp4() -> bool:
     """Whether the extra `movie` is installed."""
-    return importlib.util.find_spec("imageio_ffmpeg") is not None
+    try:
+        import imageio_ffmpeg  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
 
 def check_movie(option: str, path: str | Path) -> Path:
