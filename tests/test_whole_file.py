@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from torchcrf_scan.whole_file import write_whole
+from torchcrf_scan.whole_file import whole_path, write_whole
 
 
 def fail(*_: object) -> None:
@@ -38,7 +38,17 @@ def test_a_disk_that_is_full_in_earnest(tmp_path: Path) -> None:
     path = tmp_path / "file"
     write_whole(path, b"good")
     (tmp_path / f".file.{os.getpid()}").symlink_to(full)
-    with pytest.raises(OSError, match="No space left on device"):
+    with pytest.raises(OSError, match=r"No space left on device: '.*file'$"):
         write_whole(path, b"x" * 100_000)
     assert path.read_bytes() == b"good"
     assert [of.name for of in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_pipe_or_device_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="pipe: expected a file to write, got a device or pipe"):
+        write_whole(tmp_path / "pipe", b"x")
+    with pytest.raises(OSError, match="got a device or pipe"), whole_path(tmp_path / "pipe"):
+        pass
+    assert (tmp_path / "pipe").is_fifo()
+    assert [of.name for of in tmp_path.iterdir()] == ["pipe"]

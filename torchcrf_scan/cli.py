@@ -77,7 +77,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         options = parser.instantiate(parsed)[parsed.command]
         code = COMMANDS[parsed.command](**arguments_of(COMMANDS[parsed.command], vars(options)))
-        sys.stdout.flush()
+        if sys.stdout is not None:  # closed before we began (`>&-`)
+            sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output closed the pipe (`| head`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1

@@ -26,8 +26,10 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None and error.errno is not None:  # of a write, e.g. a full disk
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
     _sync(path.parent)
 
@@ -52,6 +54,9 @@ def whole_path(path: Path) -> Iterator[Path]:
 
 
 def _beside(path: Path) -> Path:
+    """A name in the same folder; raises OSError where a device or pipe would be replaced, such as /dev/null by a superuser."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(f"{path}: expected a file to write, got a device or pipe")
     return path.with_name(f".{path.name}.{os.getpid()}")
 
 

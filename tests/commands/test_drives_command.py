@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import pytest
-from command_line import run
+from command_line import fail, run
 
 pytest.importorskip("trackeval", reason="needs trackeval (extra tracking)")
 
@@ -23,6 +24,11 @@ def test_a_short_drive_is_scored(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert values["scans_per_second"] > 0
     assert 0 <= values["false_moving"] < 20
     assert 0 <= values["hota"] <= 100
+
+
+def test_without_trackeval_it_says_so_at_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setitem(sys.modules, "trackeval", None)
+    assert "expected the library trackeval, which scores tracks (extra `tracking`), got" in fail(capsys, "drives")
 
 
 @pytest.mark.parametrize(

@@ -127,8 +127,10 @@ def make_folder(option: str, folder: str | Path) -> Path:
 def check_output(output: str, log: str) -> None:
     """Raises ValueError for an output that is a folder, or would replace the log that it is made of."""
     path = Path(output)
-    if path.is_dir():
-        raise ValueError(f"--output: expected a file to write, got {output!r}, a folder")
+    if path.exists() and not path.is_file():
+        raise ValueError(
+            f"--output: expected a file to write, got {output!r}, {'a folder' if path.is_dir() else 'a device or pipe'}"
+        )
     check_other(output, log)
 
 

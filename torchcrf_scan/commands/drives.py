@@ -58,6 +58,10 @@ def drives(
     for name, value, least in (("scans", scans, 2), ("count", count, 1), ("seed", seed, 0)):
         if value < least:
             raise ValueError(f"--{name}: expected at least {least}, got {value}")
+    try:
+        import trackeval  # noqa: F401
+    except ImportError as error:
+        raise ValueError(f"expected the library trackeval, which scores tracks (extra `tracking`), got {error}") from error
     loaded = load_model(model)
     print("| world | " + " | ".join(HEADER.values()) + " |\n|" + "---|" * (len(HEADER) + 1))
     rows = {}
