@@ -86,7 +86,7 @@ def kill_in_write(step: int) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """A process of its own, which writes its losses: FOLDER [--kill-after STEP] [--kill-in-write STEP] [--GRADIENT_SETTING VALUE]."""
+    """A run that writes its losses: FOLDER [--kill-after STEP] [--kill-in-write STEP] [--GRADIENT_SETTING VALUE ...]."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kill-after", type=int)

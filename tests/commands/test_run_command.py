@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import fail, run
+from forked import CONTEXT
 from PIL import Image
 from results import FakeStream, carmen_log
 
-from torchcrf_scan.commands import recording
+from torchcrf_scan.commands import apart, recording
 from torchcrf_scan.commands.outputs import Outputs
 from torchcrf_scan.data.trajectory_file import read_trajectory
 from torchcrf_scan.viz.movie import can_write_mp4
@@ -30,6 +31,12 @@ def stream(monkeypatch: pytest.MonkeyPatch) -> FakeStream:
     fake = FakeStream()
     monkeypatch.setattr(recording.Options, "make_stream", lambda self: lambda: fake)
     return fake
+
+
+@pytest.fixture
+def fast_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Movies are made in processes that begin at once; the others' begin takes seconds."""
+    monkeypatch.setattr(apart.multiprocessing, "get_context", lambda kind: CONTEXT)
 
 
 @pytest.fixture
@@ -57,6 +64,7 @@ def test_run_writes_everything(stream: FakeStream, log: Path, tmp_path: Path, ca
     assert told.endswith(f"; in {tmp_path / 'out'}\n")
 
 
+@pytest.mark.usefixtures("fast_start")
 @pytest.mark.parametrize(
     ("command", "name"), [("odometry", "poses.tum"), ("track", "tracks.csv"), ("play", "movie.gif"), ("play", "movie.mp4")]
 )
@@ -85,6 +93,7 @@ def test_odometry_is_used_when_asked_for(stream: FakeStream, log: Path, tmp_path
     np.testing.assert_allclose(np.array(stream.odometry[3:])[:, 1], [0.1, 0.2, 0.3])
 
 
+@pytest.mark.usefixtures("fast_start")
 def test_what_comes_before_a_fault_is_written(stream: FakeStream, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = carmen_log(tmp_path / "cut.log", fault=True)
     assert run("run", log, "--output", tmp_path / "out", "--clean") == 1
@@ -97,6 +106,7 @@ def test_what_comes_before_a_fault_is_written(stream: FakeStream, tmp_path: Path
     assert (tmp_path / "out" / "clean.log").read_text().count("FLASER 60") == 30
 
 
+@pytest.mark.usefixtures("fast_start")
 def test_a_bad_scan_is_left_out_and_counted(
     stream: FakeStream, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -108,6 +118,7 @@ def test_a_bad_scan_is_left_out_and_counted(
     assert (tmp_path / "out" / "clean.log").read_text().count("FLASER") == 28
 
 
+@pytest.mark.usefixtures("fast_start")
 def test_a_malformed_line_is_left_out_and_counted(
     stream: FakeStream, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -121,6 +132,7 @@ def test_a_malformed_line_is_left_out_and_counted(
     assert (tmp_path / "out" / "clean.log").read_text().count("FLASER") == 30
 
 
+@pytest.mark.usefixtures("fast_start")
 def test_several_logs_have_folders_and_a_bad_one_stops_no_other(
     stream: FakeStream, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -148,6 +160,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(log: Path, tmp_path: Path, cap
     assert not list(tmp_path.glob("out/*"))
 
 
+@pytest.mark.usefixtures("fast_start")
 def test_an_output_that_fails_is_given_up_and_the_others_go_on(
     stream: FakeStream, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
