@@ -16,6 +16,8 @@ from torchcrf_scan.baselines.register import by_command
 from torchcrf_scan.baselines.start import match_start, match_static
 from torchcrf_scan.commands import frames
 from torchcrf_scan.commands.arguments import batches, find_files, load_model, make_folder
+from torchcrf_scan.commands.causes import check as check_causes
+from torchcrf_scan.commands.causes import explain
 from torchcrf_scan.commands.frames import FrameOffset, Turn, match_displaced
 from torchcrf_scan.data.pair_file import read_pair, read_prediction
 from torchcrf_scan.model import JointScanCRF
@@ -57,6 +59,9 @@ def evaluate(
     frame_offset: float | None = None,
     frame_turn: Turn | None = None,
     seed: int = 0,
+    causes: bool = False,
+    worst: int = 6,
+    output: str | None = None,
     candidates: int | None = None,
     device: str = "cpu",
     threads: int | None = None,
@@ -77,6 +82,9 @@ def evaluate(
         frame_offset: metres by which the second scan's frame is displaced, exactly, in a random direction
         frame_turn: radians by which it is turned, exactly, to a random side; or any, uniform over the whole circle
         seed: seed of the random directions and sides
+        causes: also where wrong points come from (joint alone)
+        worst: with --causes, number of pairs with the most wrong points to name
+        output: with --causes, folder for its tables (causes.md) and pictures of the worst pairs
         candidates: target points considered for each source point, 0 for all; by default as the model was saved
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; by default its own choice
@@ -87,20 +95,24 @@ def evaluate(
     if predictions is not None and (method, model) != (None, None):
         raise ValueError("--predictions: expected no --method and no --model beside it, got both")
     displacement = _displacement(frame_offset, frame_turn, predictions)
+    check_causes(output, worst, causes, method, (predictions, displacement))
     if json is not None:
         make_folder("--json", Path(json).parent)
     pairs = _annotated_pairs(pair_files)
+    load = partial(load_model, PRETRAINED if model is None else model, candidates, device, threads)
     if predictions is not None:
         name, answers = Path(predictions).resolve().name, _read_predictions(list(pairs), Path(predictions))
     else:
         name = "joint" if method is None else method
-        load = partial(load_model, PRETRAINED if model is None else model, candidates, device, threads)
         answers = _run(name, load, list(pairs.values()), displacement, seed)
     scores = [score_pair(pair, answer) for pair, answer in zip(pairs.values(), answers, strict=True)]
     tables, figures = report(_rows(name, scores)), _figures(name, scores)
     if displacement is not None:
         tables.append(_displaced_table(displacement, _rows(name, scores)))
         figures |= _displaced_figures(displacement, seed, scores)
+    if causes:
+        more, counts = explain(load(), list(pairs.values()), worst, output)
+        tables, figures = tables + more, figures | counts
     print("\n".join(table.to_markdown() for table in tables), end="")
     if json is not None:
         write_whole(Path(json), json_format.dumps(figures, indent=2) + "\n")
