@@ -53,7 +53,7 @@ def with_true_motions(model: JointScanCRF, pair: ScanPair, trace: SearchTrace) -
     truth, movers = annotation_of(pair), _movers(pair, trace)
     background = truth.motions[BACKGROUND]
     rows = [background if np.isfinite(background).all() else trace.background, *(of.motion for of in movers.values())]
-    members = np.array([of.is_member for of in movers.values()]).reshape(-1, len(pair.source))
+    members = np.array([of.is_member for of in movers.values()], dtype=bool).reshape(len(movers), len(pair.source))
     return _from(_at_given_motions(model), pair, np.stack(rows), members)
 
 
@@ -76,6 +76,9 @@ def _movers(pair: ScanPair, trace: SearchTrace) -> dict[int, TrueMover]:
 def _from(model: JointScanCRF, pair: ScanPair, motions: Floats, members: Bools) -> PairPrediction:
     """The answer from a start with these clusters and no others: motions (1+G, 3) and the movers' points (G, N)."""
     batch, C = _batch(model, pair), model.config.motions
+    arrays = pair_of(batch, 0)
+    if arrays.fewest_points == 0:
+        return model(batch).pair(0, pair)
     motions, members = motions[:C], members[: C - 1]
     rows = np.concatenate([motions, np.repeat(motions[:1], C - len(motions), axis=0)])  # empty slots, as in the search
     every = np.zeros((C, len(pair.source)), np.bool_)
@@ -83,8 +86,7 @@ def _from(model: JointScanCRF, pair: ScanPair, motions: Floats, members: Bools) 
     like = batch.source
     active = torch.arange(C, device=like.device)[None] <= len(members)
     at = torch.from_numpy(rows)[None].to(like)
-    arrays = pair_of(batch, 0)
-    unit = torch.tensor([resolution(arrays.source, arrays.target, arrays.noise) if arrays.fewest_points else 1.0]).to(like)
+    unit = torch.tensor([resolution(arrays.source, arrays.target, arrays.noise)]).to(like)
     reach = beyond_reach(batch.source, torch.from_numpy(every)[None].to(like.device), unit)
     start = Start(at, active, nearest_association(batch, at, active, reach), model.initialise(batch).target_tangents, reach)
     return model(batch, start).pair(0, pair)

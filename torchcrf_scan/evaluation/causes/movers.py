@@ -23,7 +23,7 @@ FATES = (FOUND, *STATES[1:], MISLABELLED)
 
 SLIDING, EDGE, A_LITTLE_OFF, OTHER = "sliding along its own line", "at an occlusion edge", "static, a little off", "other"
 FALSE_KINDS = (SLIDING, EDGE, A_LITTLE_OFF, OTHER)
-THIN = 0.2  # width over length of a line
+THIN = 0.3  # width over length of a line
 ALONG = 0.9  # share of the way along the line
 NEARER = 5.0  # units by which the return beside it is nearer at an occlusion edge
 A_LITTLE = 2.0  # units of displacement
