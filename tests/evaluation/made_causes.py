@@ -34,7 +34,7 @@ def make_street() -> Street:
     association = np.append(np.arange(55), np.full(5, -1))
     cluster = np.where(association >= 0, BODY, -1)
     truth = Annotation(association, cluster, MOTIONS, BODY, np.zeros(60, bool))
-    pair = ScanPair(scan_of(source), scan_of(target), annotation=truth, sequence="street", name="by hand")
+    pair = ScanPair(scan_of(source), scan_of(target), dt=0.11, annotation=truth, sequence="street", name="by hand")
     ones = np.ones(60)
     return Street(pair, PairPrediction(association.copy(), cluster.copy(), MOTIONS.copy(), ones, ones, True), trace_of(pair))
 

@@ -11,7 +11,8 @@ from made_pairs import PREDICTORS, make_pair
 
 from torchcrf_scan.evaluation.calibration import rightness
 from torchcrf_scan.evaluation.causes.blame import wrong_points
-from torchcrf_scan.evaluation.causes.outliers import OutlierCase, best_gate, clusters_beneath, with_true_outliers
+from torchcrf_scan.evaluation.causes.outliers import OutlierCase, best_gate, with_true_outliers
+from torchcrf_scan.evaluation.counterparts import clusters_beneath
 
 
 @pytest.fixture

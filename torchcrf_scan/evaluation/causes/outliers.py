@@ -8,19 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from torchcrf_scan.evaluation.counterparts import clusters_beneath
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, Ints, PairPrediction, ScanPair
-
-
-def clusters_beneath(pair: ScanPair, prediction: PairPrediction) -> Ints:
-    """(N,) cluster of every source point, that of the nearest answered inlier for answered outliers; background without any."""
-    beam, points = pair.source.beam, pair.source.points
-    cluster = prediction.cluster[beam]
-    is_inlier = (cluster != OUTLIER) & (prediction.association[beam] >= 0)
-    if not is_inlier.any():
-        return np.maximum(cluster, BACKGROUND)
-    nearest = cKDTree(points[is_inlier]).query(points)[1]
-    return np.where(cluster == OUTLIER, cluster[is_inlier][nearest], cluster)
+from torchcrf_scan.scan import OUTLIER, Bools, Floats, Ints, PairPrediction, ScanPair
 
 
 def nearest_targets(pair: ScanPair, motions: Floats, cluster: Ints) -> tuple[Floats, Ints]:
