@@ -22,8 +22,7 @@ class StreamConfig:
         gap: seconds without a placed scan after which the stream starts anew from the predicted pose.
         memory: number of earlier scans asked what they saw where a point lies now,
         memory_spacing: and seconds between them.
-        least_way: metres that a track goes before it counts as a moving object,
-        least_speed: or metres per second that it is fast.
+        least_speed: metres per second, below which nothing counts as a moving object.
         deskew: scans with beam times are corrected for the motion during their sweep.
     """
 
@@ -36,8 +35,7 @@ class StreamConfig:
     gap: Annotated[float, Within(0, above=True)] = 2.0
     memory: Annotated[int, Within(0, 1000)] = 6
     memory_spacing: Amount = 0.5
-    least_way: Amount = 0.4
-    least_speed: Amount = 0.7
+    least_speed: Amount = 0.2
     deskew: bool = True
 
     def __post_init__(self) -> None:

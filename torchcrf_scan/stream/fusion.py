@@ -1,6 +1,8 @@
-"""A measured pose and the predicted one, each as far as it is certain: what is not observed follows the prediction."""
+"""What is believed of a measured pose: what is not observed follows the prediction, and what stands does not tremble."""
 
 from __future__ import annotations
+
+from collections import deque
 
 import numpy as np
 
@@ -10,6 +12,12 @@ from torchcrf_scan.stream.covariance import turned
 
 ACCELERATION = (20.0, 10.0, 10.0)  # rad/s^2 and m/s^2, standard deviations of what constant velocity does not foresee
 DOUBT = 4.0  # factor on the covariance of a measured pose: errors of real scanners are larger than promised
+
+SETTLING = 1.0  # seconds whose poses are averaged of a sensor that stands
+MOST_POSES = 100  # that are remembered
+FEWEST = 4  # poses in that time, from which it may be seen to stand
+STANDS = 3.0  # standard deviations that a pose may be off their median,
+MOST = (0.01, 0.02, 0.02)  # rad and metres, but never more
 
 
 def fused(predicted: Floats, measured: Floats, covariance: Floats, elapsed: float) -> Floats:
@@ -23,3 +31,37 @@ def fused(predicted: Floats, measured: Floats, covariance: Floats, elapsed: floa
     prior = np.diag(np.square(np.array(ACCELERATION) * elapsed**2 / 2))
     gain = np.linalg.solve(prior + DOUBT * turned(covariance, -float(predicted[0])), prior).T
     return se2.compose(predicted, gain @ ahead)
+
+
+class Standing:
+    """The last poses as they were measured: a sensor that stands is where most of them were."""
+
+    def __init__(self) -> None:
+        self._poses: deque[tuple[float, Floats]] = deque()
+
+    def settled(self, pose: Floats, covariance: Floats, time: float) -> Floats:
+        """(3,) the median of the poses of the last second, if the measured one (3,) is within its uncertainty of it; else that.
+
+        Args:
+            covariance: (3, 3) of the pose, in the world. time: seconds.
+        """
+        before = [of for since, of in self._poses if 0 <= time - since <= SETTLING]
+        if len(before) < FEWEST:
+            return pose
+        apart = np.array([*before, pose]) - pose
+        apart[:, 0] = se2.wrap(apart[:, 0])
+        middle = np.median(apart, axis=0)
+        bound = np.minimum(STANDS * np.sqrt(np.diag(covariance)), MOST)
+        if (np.abs(middle) > bound).any():
+            return pose
+        return np.array([se2.wrap(pose[0] + middle[0]), *(pose + middle)[1:]])
+
+    def add(self, pose: Floats, time: float) -> None:
+        """Remembers a measured pose (3,)."""
+        self._poses.append((time, pose))
+        while time - self._poses[0][0] > SETTLING or len(self._poses) > MOST_POSES:
+            self._poses.popleft()
+
+    def clear(self) -> None:
+        """Forgets all."""
+        self._poses.clear()

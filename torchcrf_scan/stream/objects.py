@@ -14,6 +14,7 @@ from torchcrf_scan.search.expected import Expected
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.stream.config import StreamConfig
 from torchcrf_scan.stream.memory import Memory, Votes
+from torchcrf_scan.stream.movers import Movers
 from torchcrf_scan.stream.tracks import Tracker, TrackPrediction
 from torchcrf_scan.stream.view import View
 
@@ -56,9 +57,7 @@ class Objects:
     def __init__(self, config: StreamConfig) -> None:
         self.tracker = Tracker()
         self.memory = Memory(config.memory_spacing, config.memory)
-        self._config = config
-        self._births: dict[int, Floats] = {}  # where confirmed tracks were first seen, by number
-        self._movers: set[int] = set()  # those that have moved since
+        self.movers = Movers(config.least_speed)
 
     def expect(self, grid: ScanGrid, votes: Votes, pose: Floats, reference: View, time: float) -> Expected:
         """What is known of the movers of a scan before it is matched to an earlier one: hypotheses, never trusted blindly.
@@ -91,19 +90,10 @@ class Objects:
         since = view.time - reference.time
         turns = turns_over_ground(view, found, reference, len(seen.velocity))
         numbers, objects = self.tracker.update(view.time, points, seen.label, seen.velocity, seen.covariance, sensor, since, turns)
-        movers = self._that_moved(objects)
+        movers = self.movers.update(view.time, objects)
         known = np.where(np.isin(numbers, [of.number for of in movers]), numbers, OUTLIER)
         track = np.concatenate([[BACKGROUND], known, [OUTLIER]])[seen.label]  # label -1 is the last
         return Moving(track > BACKGROUND, track, movers)
-
-    def _that_moved(self, objects: Sequence[MovingObject]) -> tuple[MovingObject, ...]:
-        """Confirmed tracks that went some way or are fast, now or earlier: the edge of a shadow may be followed too."""
-        self._births = {of.number: self._births.get(of.number, of.position) for of in objects}
-        way, speed = self._config.least_way, self._config.least_speed
-        gone = {of.number for of in objects if np.hypot(*(of.position - self._births[of.number])) > way}
-        fast = {of.number for of in objects if np.hypot(*of.velocity) > speed}
-        self._movers = (self._movers & self._births.keys()) | gone | fast
-        return tuple(of for of in objects if of.number in self._movers)
 
     def begin(self, view: View) -> None:
         """Begins with a scan, the first or that after a gap: what earlier ones saw is forgotten; objects end by themselves."""

@@ -16,7 +16,7 @@ from torchcrf_scan.stream.clock import Clock
 from torchcrf_scan.stream.config import StreamConfig
 from torchcrf_scan.stream.covariance import LEAST, unknown, velocity_covariance, world_covariance
 from torchcrf_scan.stream.deskew import Deskewing, deskewed
-from torchcrf_scan.stream.fusion import fused
+from torchcrf_scan.stream.fusion import MOST, Standing, fused
 from torchcrf_scan.stream.memory import Votes
 from torchcrf_scan.stream.objects import Moving, Objects, nothing_moves
 from torchcrf_scan.stream.placement import Placement, explained_by, grid_at, place
@@ -37,11 +37,13 @@ class _Placed:
     """A scan placed in the world.
 
     Attributes:
-        covariance: (3, 3) of its pose. placement: on the keyframe or, if not `on_keyframe`, on the scan that it was matched to.
+        measured: (3,) its pose before it is settled. covariance: (3, 3) of it.
+        placement: on the keyframe or, if not `on_keyframe`, on the scan that it was matched to.
         is_torn: the two disagree.
     """
 
     view: View
+    measured: Floats
     covariance: Floats
     placement: Placement
     on_keyframe: bool
@@ -68,6 +70,7 @@ class ScanStream:
         self._deskewing = Deskewing(self.config.deskew)
         self._history = History(self.config.history)
         self._objects = Objects(self.config)
+        self._standing = Standing()
         self._keyframe: View | None = None
         self._pose, self._twist = np.zeros(3), np.zeros(3)
         self._covariance = LEAST
@@ -185,8 +188,9 @@ class ScanStream:
             pose = fused(predicted, pose, covariance, self._now - self._history.last.time)
         is_less = explains_less(pose, guess, grid, reference)  # what is not observed was predicted wrongly
         pose, on_keyframe = (guess, False) if is_less else (pose, on_keyframe)
-        view = View(scan, grid, background, pose, self._now)
-        return _Placed(view, covariance, placement, on_keyframe, is_less or is_astray)
+        settled = self._standing.settled(pose, covariance, self._now)
+        view = View(scan, grid, background, settled, self._now)
+        return _Placed(view, pose, covariance, placement, on_keyframe, is_less or is_astray)
 
     def _take(self, placed: _Placed, interval: float) -> Floats:
         """Remembers a placed scan; returns (3, 3) covariance of the velocity."""
@@ -197,6 +201,8 @@ class ScanStream:
         if placed.is_torn:  # scans that disagree about where the sensor was would be believed in turn
             self._history.clear()
             self._objects.begin(placed.view)
+            self._standing.clear()
+        self._standing.add(placed.measured, self._now)
         self._history.add(placed.view, self.config.lag)
         if not (placed.on_keyframe and self._keeps_keyframe(placed.placement)):
             self._keyframe = placed.view
@@ -206,7 +212,8 @@ class ScanStream:
         theta, x, y = placement.motion
         config = self.config
         is_near = np.hypot(x, y) < config.keyframe_distance and abs(theta) < config.keyframe_turn
-        return bool(is_near and placement.share >= config.keyframe_share)
+        is_there = (np.abs(placement.motion) < MOST).all()  # a newer keyframe would see the same, and be less certain
+        return bool(is_near and placement.share >= config.keyframe_share * (DOUBTED if is_there else 1.0))
 
     # --- the answers --------------------------------------------------------------------------------------------------------------
 
@@ -214,6 +221,7 @@ class ScanStream:
         """The first scan, and that after a gap: all background."""
         self._history.clear()
         self._objects.begin(view)
+        self._standing.clear()
         self._history.add(view, self.config.lag)
         self._keyframe, self._pose, self._covariance = view, view.pose, LEAST
         self._has_velocity, self._twist = False, np.zeros(3)
