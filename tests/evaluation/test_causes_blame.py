@@ -13,7 +13,7 @@ from made_pairs import PREDICTORS, make_pair, motion_rows_missing
 from torchcrf_scan import JointScanCRF, PairPrediction, ScanPair
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.evaluation.calibration import rightness
-from torchcrf_scan.evaluation.causes.blame import CAUSES, KEPT, LABEL, PLACE, REJECTED, Blame, blame, wrong_points
+from torchcrf_scan.evaluation.causes.blame import CAUSES, KEPT, LABEL, LED_ASTRAY, PLACE, REJECTED, Blame, blame, wrong_points
 from torchcrf_scan.evaluation.causes.movers import (
     A_LITTLE_OFF,
     ASTRAY,
@@ -153,6 +153,15 @@ def test_outlier_decisions_of_either_chain(street: Street) -> None:
 def test_two_beams_off_is_right_and_three_is_the_wrong_place(street: Street) -> None:
     assert counted(blamed(street, labelled(street.answer, slice(10, 20), association=2))) == {}
     assert counted(blamed(street, labelled(street.answer, slice(10, 20), association=3))) == {PLACE: 10}
+
+
+def test_a_motion_a_little_off_leads_astray(street: Street) -> None:
+    """The car's points are a quarter of a metre apart; 0.75 m is little if a unit is half a metre."""
+    coarse = replace(street.trace, units=np.full(60, 0.5))
+    answer = labelled(street.answer, slice(41, 46), association=3)
+    off = replace(answer, motions=MOTIONS + np.eye(3, 1, -1) @ [[0.0, 0.0, 0.75]])
+    assert counted(blamed(street, off, coarse)) == {LED_ASTRAY: 5}
+    assert counted(blamed(street, answer, coarse)) == {PLACE: 5}
 
 
 def test_many_causes_at_once_each_by_its_own_points(street: Street) -> None:

@@ -78,7 +78,7 @@ def evaluate(
         predictions: folder of prediction files named like the pair files, instead of a method
         method: joint (the model, default), start (its start and nearest points, no field), static (nothing moves), background
             (one registration, all of it background), icp (the paper's) or ransac (registration, then movers by RANSAC)
-        model: folder of a saved model, or the name of one that the package ships; simulated by default
+        model: folder of a saved model, or the name of one that the package ships; encoder by default
         json: file for all metrics with all digits
         frame_offset: metres by which the second scan's frame is displaced, exactly, in a random direction
         frame_turn: radians by which it is turned, exactly, to a random side; or any, uniform over the whole circle

@@ -8,7 +8,8 @@ first of these questions that is answered with yes gives the cause; true labels 
 3. Is the point of an answered mover that is none? Then its kind (`movers.FALSE_KINDS`).
 4. An inlier in another inlier cluster: the label is wrong although the motions are right.
 5. An inlier called outlier by either chain, or an outlier kept by either.
-6. What is left are associations to the wrong place of the right body.
+6. What is left are associations to the wrong place of the right body: the nearest target point is right under the true motion and
+   wrong under the answered one, or it is something else.
 """
 
 from __future__ import annotations
@@ -31,16 +32,15 @@ from torchcrf_scan.evaluation.causes.movers import (
     kind_of_false_mover,
     state_of,
 )
+from torchcrf_scan.evaluation.causes.outliers import nearest_targets
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
+from torchcrf_scan.evaluation.counterparts import beams_apart
 from torchcrf_scan.evaluation.metrics import PairScore
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Ints, PairPrediction, ScanPair
 
-LABEL, REJECTED, KEPT, PLACE = (
-    "label wrong, motions right",
-    "inlier called outlier",
-    "outlier kept",
-    "wrong place of the right body",
-)
+LABEL, REJECTED, KEPT = "label wrong, motions right", "inlier called outlier", "outlier kept"
+LED_ASTRAY, PLACE = "wrong place of the right body: motion a little off", "wrong place of the right body: other"
+NEAR = 2  # target beams up to which an association is right
 CAUSES = (
     BACKGROUND_OFF,
     *(f"mover: {state}" for state in STATES if state not in (RIGHT, BACKGROUND_OFF)),
@@ -48,6 +48,7 @@ CAUSES = (
     LABEL,
     REJECTED,
     KEPT,
+    LED_ASTRAY,
     PLACE,
 )
 
@@ -104,7 +105,7 @@ def blame(pair: ScanPair, prediction: PairPrediction, trace: SearchTrace, score:
     Raises:
         ValueError: a pair without annotation.
     """
-    right, truth, beam = rightness(pair, prediction), pair.annotation, pair.source.beam
+    right, truth, beam = rightness(pair, prediction, NEAR), pair.annotation, pair.source.beam
     assert truth is not None
     cluster = prediction.cluster[beam]
     body, movers = _movers_of(pair, truth, trace)
@@ -128,9 +129,20 @@ def blame(pair: ScanPair, prediction: PairPrediction, trace: SearchTrace, score:
     put(LABEL, ~is_outlier & (cluster != OUTLIER) & ~right.cluster)
     put(REJECTED, ~is_outlier & is_called)
     put(KEPT, is_outlier)
+    put(LED_ASTRAY, _is_led_astray(pair, prediction, body))
     put(PLACE, left.copy())
     number_of_kind = {kind: list(kinds.values()).count(kind) for kind in FALSE_KINDS}
     return Blame(int(right.known.sum()), cause, _fates(states, score), number_of_kind, pair.name, pair.sequence)
+
+
+def _is_led_astray(pair: ScanPair, prediction: PairPrediction, body: Ints) -> Bools:
+    """(N,) whether a point's nearest target is right, within `NEAR` beams, under its body's true motion, not under the answered."""
+    truth, beam = pair.annotation, pair.source.beam
+    assert truth is not None
+    _, by_truth = nearest_targets(pair, truth.motions, body)
+    _, by_answer = nearest_targets(pair, prediction.motions, prediction.cluster[beam])
+    off, found_off = (beams_apart(pair.target, truth.association[beam], nearest) for nearest in (by_truth, by_answer))
+    return (off <= NEAR) & (found_off > NEAR)
 
 
 def _movers_of(pair: ScanPair, truth: Annotation, trace: SearchTrace) -> tuple[Ints, dict[int, TrueMover]]:

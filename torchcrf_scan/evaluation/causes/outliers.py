@@ -10,16 +10,19 @@ from scipy.spatial import cKDTree
 
 from torchcrf_scan.evaluation.counterparts import clusters_beneath
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.scan import OUTLIER, Bools, Floats, Ints, PairPrediction, ScanPair
+from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, Ints, PairPrediction, ScanPair
 
 
 def nearest_targets(pair: ScanPair, motions: Floats, cluster: Ints) -> tuple[Floats, Ints]:
-    """(N,) metres to the nearest target point under the motion of a point's cluster (N,), and (N,) its beam; inf, -1: none."""
+    """(N,) metres to the nearest target point under the motion of a point's cluster (N,), and (N,) its beam.
+
+    inf and -1 for outliers, unknown motions, and without target points.
+    """
     distance, beam = np.full(len(pair.source), np.inf), np.full(len(pair.source), OUTLIER)
     if not len(pair.target):
         return distance, beam
     tree = cKDTree(pair.target.points)
-    for number in np.unique(cluster[cluster < len(motions)]):
+    for number in np.unique(cluster[(cluster >= BACKGROUND) & (cluster < len(motions))]):
         own = cluster == number
         if np.isfinite(motions[number]).all():
             distance[own], place = tree.query(se2.apply(motions[number], pair.source.points[own]))
