@@ -90,10 +90,6 @@ def evaluate(
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; by default its own choice
     """
-    from torchcrf_scan.evaluation.metrics import score_pair
-    from torchcrf_scan.evaluation.neighbours import NeighbourScore, neighbour_tables
-    from torchcrf_scan.evaluation.report import report
-
     if predictions is not None and (method, model) != (None, None):
         raise ValueError("--predictions: expected no --method and no --model beside it, got both")
     displacement = _displacement(frame_offset, frame_turn, predictions)
@@ -107,12 +103,7 @@ def evaluate(
     else:
         name = "joint" if method is None else method
         answers = _run(name, load, list(pairs.values()), displacement, seed)
-    scores = [score_pair(pair, answer) for pair, answer in zip(pairs.values(), answers, strict=True)]
-    beside = [NeighbourScore.of(pair, answer) for pair, answer in zip(pairs.values(), answers, strict=True)]
-    tables, figures = [*report(rows_of(name, scores)), *neighbour_tables(rows_of(name, beside))], _figures(name, scores, beside)
-    if displacement is not None:
-        tables.append(_displaced_table(displacement, rows_of(name, scores)))
-        figures |= _displaced_figures(displacement, seed, scores)
+    tables, figures = _score(name, list(pairs.values()), answers, displacement, seed)
     if causes:
         more, counts = explain(load(), list(pairs.values()), worst, output)
         tables, figures = tables + more, figures | counts
@@ -120,6 +111,23 @@ def evaluate(
     if json is not None:
         write_whole(Path(json), json_format.dumps(figures, indent=2) + "\n")
     return 0
+
+
+def _score(
+    name: str, pairs: Sequence[ScanPair], answers: Sequence[PairPrediction], displacement: FrameOffset | None, seed: int
+) -> tuple[list[Table], dict[str, Any]]:
+    """All tables and the entries of `--json`."""
+    from torchcrf_scan.evaluation.metrics import score_pair
+    from torchcrf_scan.evaluation.neighbours import NeighbourScore, neighbour_tables
+    from torchcrf_scan.evaluation.report import report
+
+    scores = [score_pair(pair, answer) for pair, answer in zip(pairs, answers, strict=True)]
+    beside = [NeighbourScore.of(pair, answer) for pair, answer in zip(pairs, answers, strict=True)]
+    tables, figures = [*report(rows_of(name, scores)), *neighbour_tables(rows_of(name, beside))], _figures(name, scores, beside)
+    if displacement is not None:
+        tables.append(_displaced_table(displacement, rows_of(name, scores)))
+        figures |= _displaced_figures(displacement, seed, scores)
+    return tables, figures
 
 
 def _displacement(metres: float | None, turn: Turn | None, predictions: str | None) -> FrameOffset | None:
