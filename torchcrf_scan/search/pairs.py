@@ -27,6 +27,7 @@ from torchcrf_scan.search.expected import Expected
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.pool import Share, alone, find_background
 from torchcrf_scan.search.survey import Survey, grids_of, survey_at
+from torchcrf_scan.search.trusted import choose_background
 
 T = TypeVar("T")
 
@@ -74,10 +75,11 @@ def survey_pair(pair: Pair, share: Share = alone, expected: Expected | None = No
 
 
 def find_start(pair: Pair, share: Share) -> tuple[ScanGrid, ScanGrid, Array]:
-    """Both scans and the background's motion (3,): the refined initial motion, or the result of a search."""
+    """Both scans and the background's motion (3,): the refined initial motion, or the result of a search, checked."""
     source, target = grids_of(pair)
     is_led, background = follow(pair.initial_motion, source, target) if pair.initial_motion.any() else (False, pair.initial_motion)
-    return source, target, background if is_led else find_background(source, target, pair.initial_motion, share)
+    found = background if is_led else find_background(source, target, pair.initial_motion, share)
+    return source, target, choose_background(found, pair.initial_motion, source, target).motion
 
 
 def start_pair(pair: Pair, score: Score, clusters: int, share: Share = alone, expected: Expected | None = None) -> PairStart:
