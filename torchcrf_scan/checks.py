@@ -141,7 +141,7 @@ def _description(hint: Any) -> str:
         bounds = "".join(map(str, hint.__metadata__))
         return bounds.removeprefix(": ") if hint.__origin__ is str else _description(hint.__origin__) + bounds
     if get_origin(hint) in UNIONS:
-        return " or ".join(map(_description, get_args(hint)))
+        return " or ".join(map(_description, sorted(get_args(hint), key=lambda of: of is not type(None))))
     known = {int: "a whole number", float: "a finite number", bool: "true or false", str: "a text", type(None): "nothing"}
     return known.get(hint, "a list" if get_origin(hint) is tuple else f"settings ({getattr(hint, '__name__', hint)})")
 

@@ -73,7 +73,7 @@ class InferenceConfig:
     backend: Annotated[str, OneOf("auto", "compiled", "eager")] = "auto"
     rotation_tolerance: Amount = 1e-4
     translation_tolerance: Amount = 1e-3
-    outlier_distance: Annotated[None | float, Within(0, above=True)] = None
+    outlier_distance: Annotated[float | None, Within(0, above=True)] = None
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -95,14 +95,14 @@ def test_shares_lead_from_the_model_s_values_to_the_fitted_ones() -> None:
 
 
 def test_a_mover_s_worth_is_fitted_or_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fit(*_: object) -> object:
-        return JointScanCRF().cluster_potential  # the default: too little to fit on
-
-    monkeypatch.setattr(own_laser, "fit_potential", fit)
-    model, part = own_laser.fit_worth(shipped(), annotated(3), folds_of(annotated(3)))
-    assert not part.is_kept
+    folds = folds_of(annotated(3))
+    model, part = own_laser.fit_worth(shipped(), annotated(3), folds)
+    assert (part.value, part.is_kept, model) == ("too few examples", False, shipped())
     assert part.before == part.after
-    assert model is shipped()
+    monkeypatch.setattr(own_laser, "FEWEST_MOVERS", 0)
+    monkeypatch.setattr(own_laser, "judge_clusters", lambda *_: (torch.zeros(0), torch.zeros(0)))
+    monkeypatch.setattr(own_laser, "fit_potential", lambda *_: JointScanCRF().cluster_potential)
+    assert own_laser.fit_worth(shipped(), annotated(3), folds)[1].value.endswith("% of the way")
 
 
 def test_surprise_is_the_negative_log_likelihood() -> None:

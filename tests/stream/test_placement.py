@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats
 from torchcrf_scan.search.grid import ScanGrid
+from torchcrf_scan.search.trusted import choose_background
 from torchcrf_scan.stream.fusion import fused
 from torchcrf_scan.stream.placement import explained_by, grid_at, place
-from torchcrf_scan.stream.sanity import choose_background
 
 TRUE = np.array([0.08, 0.25, -0.1])
 

@@ -2,7 +2,7 @@
 
 Few pairs must not make a model worse. Every part is fitted on some of the pairs and measured on those left out, in turn, at
 several shares of the way from the model's own values to the fitted ones; it is kept, at the best share, only where the pairs left
-out gain by more than one standard error. The parts are fitted one after the other, each on the model with those before it.
+out gain by more than one standard error and no more points of movers are lost. The parts are fitted one after the other, each on the model with those before it.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from torch import nn
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.evaluation.calibration import rightness
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
-from torchcrf_scan.inference.state import ClusterPotential
 from torchcrf_scan.inference.uncertainty import WITHIN
 from torchcrf_scan.learning.calibration_fit import Judged, fit_confidence, judge
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.learning.scales_fit import fit_scales
-from torchcrf_scan.learning.selection_fit import fit_potential
+from torchcrf_scan.learning.selection_fit import fit_potential, judge_clusters
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import Floats, ScanPair
 
 FOLDS = 5  # at most
+FEWEST_MOVERS = 10  # true ones, and false ones, to fit their worth on
 SHARES = (0.25, 0.5, 1.0)  # of the way to the fitted values
 DISTANCES = tuple(0.02 * 1.2**k for k in range(28))  # metres, up to 2.7
 AGAIN = (0.25, 0.5, 0.25)  # weights of a distance's errors and its neighbours': one pair must not pick a lucky one
@@ -81,18 +81,20 @@ def folds_of(pairs: Sequence[ScanPair]) -> list[list[int]]:
 
 def wrong_points(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
     """(P,) annotated points of every pair whose association is more than two beams off or whose cluster is wrong."""
-    return errors(model, pairs)[:, 0]
+    return errors(model, pairs)[:, 0]  # type: ignore[no-any-return]
 
 
 @torch.no_grad()
 def errors(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
-    """(P, 2) `wrong_points`, and the points wrongly called outliers or not, of every pair."""
+    """(P, 3) `wrong_points`, points wrongly called outliers or not, and points of movers called none's, of every pair."""
     found = []
     for pair, answer in zip(pairs, model.match_pairs(pairs), strict=True):
         assert pair.annotation is not None
         right, beam = rightness(pair, answer, WITHIN), pair.source.beam
         is_confused = (pair.annotation.association[beam] < 0) != (answer.association[beam] < 0)
-        found.append([(right.known & ~(right.within & right.cluster)).sum(), (right.known & is_confused).sum()])
+        is_wrong = ~(right.within & right.cluster)
+        is_lost = (pair.annotation.body[beam] > 0) & (answer.cluster[beam] <= 0)
+        found.append([(right.known & mistake).sum() for mistake in (is_wrong, is_confused, is_lost)])
     return np.array(found, dtype=np.float64)
 
 
@@ -110,9 +112,9 @@ def with_distance(model: JointScanCRF, metres: float) -> JointScanCRF:
 
 
 def fit_distance(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
-    """The distance with the fewest errors about outliers, if there are no more wrong points with it."""
+    """The distance with the fewest errors about outliers, if no more points are wrong with it and no more of movers are lost."""
     before = errors(model, pairs)
-    tried = np.stack([errors(with_distance(model, metres), pairs) for metres in DISTANCES])  # (distances, P, 2)
+    tried = np.stack([errors(with_distance(model, metres), pairs) for metres in DISTANCES])  # (distances, P, 3)
 
     def best(rows: Sequence[int]) -> int:
         padded = np.pad(tried[:, rows, 1].sum(1), 1, mode="edge")
@@ -123,7 +125,7 @@ def fit_distance(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence
     for fold in folds:
         after[fold] = tried[best([k for k in every if k not in fold]), fold]
     metres = DISTANCES[best(every)]
-    is_kept = gains(before[:, 1], after[:, 1]) and after[:, 0].sum() <= before[:, 0].sum()
+    is_kept = gains(before[:, 1], after[:, 1]) and bool((after.sum(0) <= before.sum(0)).all())
     part = Part("outlier distance", "outlier errors", before[:, 1].sum(), after[:, 1].sum(), f"{metres:.2f} m", is_kept)
     return (with_distance(model, metres) if is_kept else model), part
 
@@ -146,12 +148,10 @@ def fit_worth(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[li
     def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> nn.Module | None:
         batch = ScanPairBatch.collate(some)
         start = of.initialise(batch.without_truth())
-        if start.log_odds is None:
-            return None
-        found = fit_potential(of, [Material(batch, start, 0, tuple(some))])
-        default = ClusterPotential().state_dict()
-        is_fitted = any(not torch.equal(value, default[name]) for name, value in found.state_dict().items())
-        return found if is_fitted else None
+        material = Material(batch, start, 0, tuple(some))
+        is_true = judge_clusters(of, material)[1] if start.log_odds is not None else torch.zeros(0)
+        has_both = min(int((is_true == label).sum()) for label in (0, 1)) >= FEWEST_MOVERS
+        return fit_potential(of, [material]) if has_both else None
 
     return fit_by_share(model, pairs, folds, "movers' worth", "cluster_potential", fit)
 
@@ -160,16 +160,18 @@ def fit_by_share(
     model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]], name: str, module: str, fit: Fit
 ) -> tuple[JointScanCRF, Part]:
     """A module of the model fitted on all pairs, at the share of the way that leaves the fewest wrong points on those left out."""
-    before = wrong_points(model, pairs)
-    after = np.tile(before, (len(SHARES), 1))
+    before = errors(model, pairs)
+    after = np.tile(before, (len(SHARES), 1, 1))
     for fold in folds:
         fitted = fit(model, [pair for k, pair in enumerate(pairs) if k not in fold])
         for row, share in enumerate(SHARES if fitted is not None else ()):
-            after[row, fold] = wrong_points(moved_towards(model, module, fitted, share), [pairs[k] for k in fold])
-    best = int(after.sum(1).argmin())
+            after[row, fold] = errors(moved_towards(model, module, fitted, share), [pairs[k] for k in fold])
+    best = int(after[..., 0].sum(1).argmin())
     fitted = fit(model, pairs)
-    is_kept = fitted is not None and gains(before, after[best])
-    part = Part(name, "wrong points", before.sum(), after[best].sum(), f"{100 * SHARES[best]:.0f} % of the way", is_kept)
+    is_safe = after[best, :, 2].sum() <= before[:, 2].sum()
+    is_kept = fitted is not None and is_safe and gains(before[:, 0], after[best, :, 0])
+    told = "too few examples" if fitted is None else f"{100 * SHARES[best]:.0f} % of the way"
+    part = Part(name, "wrong points", before[:, 0].sum(), after[best, :, 0].sum(), told, is_kept)
     return (moved_towards(model, module, fitted, SHARES[best]) if is_kept else model), part
 
 

@@ -27,6 +27,7 @@ from torchcrf_scan.search.expected import Expected
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.pool import Share, alone, find_background
 from torchcrf_scan.search.survey import Survey, grids_of, survey_at
+from torchcrf_scan.search.trusted import choose_background
 
 T = TypeVar("T")
 
@@ -36,10 +37,22 @@ def initialise(batch: ScanPairBatch, score: Score, clusters: int) -> Start:
     return start_tensors(start_pairs([pair_of(batch, b) for b in range(len(batch))], score, clusters), batch)
 
 
-def start_pairs(pairs: Sequence[Pair], score: Score, clusters: int, expected: Expected | None = None) -> list[PairStart]:
-    """The same for pairs as arrays, each by itself. expected: of a single pair, movers known from before."""
+def start_pairs(
+    pairs: Sequence[Pair],
+    score: Score,
+    clusters: int,
+    expected: Expected | None = None,
+    record: list[Survey | None] | None = None,
+) -> list[PairStart]:
+    """The same for pairs as arrays, each by itself.
+
+    expected: of a single pair, movers known from before. record: gets every pair's survey, in order, as `survey_pair` gives it.
+    """
     assert expected is None or len(pairs) == 1
-    return of_pairs(lambda pair, share: start_pair(pair, score, clusters, share, expected), pairs)
+    if record is None:
+        return of_pairs(lambda pair, share: start_pair(pair, score, clusters, share, expected), pairs)
+    record += of_pairs(lambda pair, share: survey_pair(pair, share, expected), pairs)
+    return [start_from(pair, seen, score, clusters) for pair, seen in zip(pairs, record[-len(pairs) :], strict=True)]
 
 
 def survey(batch: ScanPairBatch) -> list[Survey | None]:
@@ -62,10 +75,11 @@ def survey_pair(pair: Pair, share: Share = alone, expected: Expected | None = No
 
 
 def find_start(pair: Pair, share: Share) -> tuple[ScanGrid, ScanGrid, Array]:
-    """Both scans and the background's motion (3,): the refined initial motion, or the result of a search."""
+    """Both scans and the background's motion (3,): the refined initial motion, or the result of a search, checked."""
     source, target = grids_of(pair)
     is_led, background = follow(pair.initial_motion, source, target) if pair.initial_motion.any() else (False, pair.initial_motion)
-    return source, target, background if is_led else find_background(source, target, pair.initial_motion, share)
+    found = background if is_led else find_background(source, target, pair.initial_motion, share)
+    return source, target, choose_background(found, pair.initial_motion, source, target).motion
 
 
 def start_pair(pair: Pair, score: Score, clusters: int, share: Share = alone, expected: Expected | None = None) -> PairStart:

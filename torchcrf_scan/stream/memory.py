@@ -12,7 +12,7 @@ from torchcrf_scan.scan import Bools, Floats, Ints, Scan
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.leftover import OPEN, leftover_of
 from torchcrf_scan.search.surface import SEEN_THROUGH
-from torchcrf_scan.stream.placement import TIGHT
+from torchcrf_scan.search.trusted import TIGHT
 from torchcrf_scan.stream.view import View
 
 LEAST_THROUGH = 2  # scans that saw free space where a point is, from which it counts as moved,

@@ -16,9 +16,9 @@ from torchcrf_scan.search.background import refine, unit_length
 from torchcrf_scan.search.grid import ScanGrid, grid_of
 from torchcrf_scan.search.leftover import leftover_of
 from torchcrf_scan.search.surface import surface_of
+from torchcrf_scan.search.trusted import TIGHT
 
 TRUSTED = 0.8  # share of the points explained from which a refined motion is not doubted
-TIGHT = 1.0  # units of `leftover_of`: a return this near to a surface is explained by it
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.result import ScanResult, Status
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints, PairPrediction, Scan
 from torchcrf_scan.search.grid import ScanGrid
+from torchcrf_scan.search.trusted import LEAST_OF_BEST, Backed, choose_background
 from torchcrf_scan.stream import twist
 from torchcrf_scan.stream.clock import Clock
 from torchcrf_scan.stream.config import StreamConfig
@@ -20,7 +21,6 @@ from torchcrf_scan.stream.fusion import MOST, Standing, fused
 from torchcrf_scan.stream.memory import Votes
 from torchcrf_scan.stream.objects import Moving, Objects, nothing_moves
 from torchcrf_scan.stream.placement import Placement, explained_by, grid_at, place
-from torchcrf_scan.stream.sanity import LEAST_OF_BEST, Backed, choose_background
 from torchcrf_scan.stream.view import History, View
 
 FEWEST_POINTS = 3  # fewer returns do not determine a motion

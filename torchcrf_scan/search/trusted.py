@@ -10,8 +10,8 @@ from torchcrf_scan.scan import Bools, Floats
 from torchcrf_scan.search.background import refine
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.leftover import leftover_of
-from torchcrf_scan.stream.placement import TIGHT
 
+TIGHT = 1.0  # units of `leftover_of`: a return this near to a surface is explained by it
 LEAST_OF_BEST = 0.6  # of the returns that the best candidate explains
 
 
