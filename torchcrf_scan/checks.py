@@ -139,9 +139,11 @@ def _description(hint: Any) -> str:
     """The values that an annotation allows, in words."""
     if get_origin(hint) is Annotated:
         bounds = "".join(map(str, hint.__metadata__))
+        if type(None) in get_args(hint.__origin__):  # which has no bounds
+            return f"nothing or {' or '.join(_description(of) for of in get_args(hint.__origin__)[:-1])}{bounds}"
         return bounds.removeprefix(": ") if hint.__origin__ is str else _description(hint.__origin__) + bounds
     if get_origin(hint) in UNIONS:
-        return " or ".join(map(_description, sorted(get_args(hint), key=lambda of: of is not type(None))))
+        return " or ".join(map(_description, get_args(hint)))
     known = {int: "a whole number", float: "a finite number", bool: "true or false", str: "a text", type(None): "nothing"}
     return known.get(hint, "a list" if get_origin(hint) is tuple else f"settings ({getattr(hint, '__name__', hint)})")
 

@@ -2,7 +2,8 @@
 
 Few pairs must not make a model worse. Every part is fitted on some of the pairs and measured on those left out, in turn, at
 several shares of the way from the model's own values to the fitted ones; it is kept, at the best share, only where the pairs left
-out gain by more than one standard error and no more points of movers are lost. The parts are fitted one after the other, each on the model with those before it.
+out gain by more than one standard error and no more points of movers are lost. The parts are fitted one after the other, each on
+the model with those before it.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def folds_of(pairs: Sequence[ScanPair]) -> list[list[int]]:
 
 def wrong_points(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
     """(P,) annotated points of every pair whose association is more than two beams off or whose cluster is wrong."""
-    return errors(model, pairs)[:, 0]  # type: ignore[no-any-return]
+    return errors(model, pairs)[:, 0]
 
 
 @torch.no_grad()
