@@ -227,3 +227,10 @@ def test_torchrun_deals_logs_out(tmp_path: Path) -> None:
     assert names(tmp_path / "out") == {"a", "b"}, done.stderr
     assert all(names(tmp_path / "out" / name) == ALL for name in "ab")
     assert done.stderr.count("torchcrf-scan run: error: ") == 1
+
+
+def test_the_distance_of_outliers_is_an_option(log_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("odometry", log_file, "--output", tmp_path / "a.tum", "--model=simulated", "--outlier_distance=0.3") == 0
+    capsys.readouterr()
+    message = fail(capsys, "odometry", log_file, "--output", tmp_path / "b.tum", "--outlier_distance=-1")
+    assert "--outlier_distance: expected nothing or a finite number above 0, got -1.0" in message

@@ -56,6 +56,8 @@ class Options:
         model: folder of a saved model, or the name of one that the package ships
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; scans come one after the other, so more only wait for each other
+        outlier_distance: metres; points farther from every point of the next scan, under their own motion, are outliers, and no
+            others; by default as the model was saved
         use_odometry: takes the log's odometry as the first guess of the sensor's motion
         visualize: shows everything in the viewer of rerun while it is computed
         rerun: file (.rrd) to write for that viewer
@@ -70,6 +72,7 @@ class Options:
     model: str = PRETRAINED
     device: str = "cpu"
     threads: int = 1
+    outlier_distance: float | None = None
     use_odometry: bool = False
     visualize: bool = False
     rerun: str | None = None
@@ -94,7 +97,7 @@ class Options:
 
     def make_stream(self) -> Callable[[], Stream]:
         """A maker of streams that share one model; raises ValueError for a model or device that is not there."""
-        model = load_model(self.model, None, self.device, self.threads)
+        model = load_model(self.model, None, self.device, self.threads, self.outlier_distance)
         return lambda: ScanStream(model)
 
 
