@@ -25,6 +25,10 @@ NEIGHBOURS = 8  # on either side, at most
 RUN = 48  # neighbouring points with possibly correlated errors: a jolt lasts several degrees
 NOTHING = 1e-3  # of a point's information, so that no matrix is singular
 TINY = 1e-6  # of the scene's extent: the least noise
+EMPTY = 1000.0  # noises: the extent of a scene without points, some ten metres
+MISSING = 4.5  # beams; neighbours farther apart are not on one surface: whatever is between them returned nothing
+LEAST_TURN = 1e-9  # radians; several returns of one beam are not neighbouring beams
+STRAIGHT = 3.0  # noises that the middle one of three neighbours may be off the line through the others
 MOST_CERTAIN = -50.0  # log-beliefs below this are treated as impossible
 WITHIN = 2  # target points; nearer associations count as equal, since annotations err by one themselves
 
@@ -51,7 +55,8 @@ def motion_covariance(
         scale: () or (B,) residual at which a robust weight is one half. noise: (B,) standard deviation of a range.
             Both in the unit of the points.
     """
-    reach = torch.linalg.vector_norm(source, dim=-1).detach().amax(-1).clamp(min=1e-3)  # (B,)
+    reach = torch.linalg.vector_norm(source, dim=-1).detach().amax(-1)  # (B,)
+    reach = torch.where(reach > 0, reach, EMPTY * noise).clamp(min=1e-3)
     noise = noise.maximum(TINY * reach)
     at = Linearisation.of(source, support, motions, metric, scale, noise)
     total = at.weights.sum(-1).clamp(min=1e-9)  # (B, C)
@@ -121,11 +126,16 @@ class Linearisation:
 
 
 def moved_tangents(source: Tensor, support: Support, motions: Tensor, noise: Tensor) -> Tensor:
-    """(B, C, N, 2) direction of the surface under every motion; 0 for an isolated partner. Arguments as in `motion_covariance`."""
-    tangent, is_found = surface_tangents(source, support.weights.sum(1) > 0, noise)
+    """(B, C, N, 2) direction of the surface under every motion; 0 for an isolated partner. Arguments as in `motion_covariance`.
+
+    Far away, where a wall is seen at a grazing angle, its returns are isolated; in line with their neighbours they are no ends.
+    """
+    run = surface_runs(source.detach())
+    tangent, is_found = surface_tangents(source, support.weights.sum(1) > 0, noise, run)
     turned = se2.rotate(motions[..., :1], tangent[:, None])
     given = support.tangent[:, None]
-    return torch.where(is_found[:, None, :, None] & (given != 0).any(-1, keepdim=True), turned, given)
+    is_surface = (given != 0).any(-1) | is_straight(source.detach(), run, noise)[:, None]  # (B, 1, N)
+    return torch.where((is_found[:, None] & is_surface)[..., None], turned, given)
 
 
 def about_origin(local: Tensor, length: Tensor, offset: Tensor) -> Tensor:
@@ -152,17 +162,50 @@ def shared_scores(score: Tensor) -> Tensor:
     return (runs @ runs.mT / RUN).unflatten(0, score.shape[:2])
 
 
-def surface_tangents(points: Tensor, mask: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+def surface_runs(points: Tensor) -> Tensor:
+    """(B, N) ascending numbers of the runs of neighbouring beams of which few are missing; padding, at the sensor, belongs to none.
+
+    points: (B, N, 2) in beam order, as seen from the sensor.
+    """
+    here, there = points[:, :-1], points[:, 1:]
+    cross = here[..., 0] * there[..., 1] - here[..., 1] * there[..., 0]
+    turn = torch.atan2(cross, (here * there).sum(-1)).abs()  # (B, N-1)
+    real = (here != 0).any(-1) & (there != 0).any(-1)
+    if turn.shape[-1] == 0:
+        return torch.zeros_like(points[..., 0], dtype=torch.int64)
+    step = turn.masked_fill(~real | (turn < LEAST_TURN), torch.nan).nanmedian(-1, keepdim=True).values
+    is_apart = ~real | (turn > MISSING * step)
+    return torch.nn.functional.pad(is_apart.long().cumsum(-1), (1, 0))
+
+
+def is_straight(points: Tensor, run: Tensor, noise: Tensor) -> Tensor:
+    """(B, N) whether a point is in line with two neighbours of its run. points: (B, N, 2); run: (B, N); noise: (B,)."""
+    first, middle, last = points[:, :-2], points[:, 1:-1], points[:, 2:]
+    chord, arm = last - first, middle - first
+    off = (chord[..., 0] * arm[..., 1] - chord[..., 1] * arm[..., 0]).abs()
+    length = torch.linalg.vector_norm(chord, dim=-1)
+    is_line = (off <= STRAIGHT * noise[:, None] * length) & (length > 0) & (run[:, :-2] == run[:, 2:])  # (B, N-2)
+    if points.shape[1] < 3:
+        return torch.zeros_like(points[..., 0], dtype=torch.bool)
+    sides = [torch.nn.functional.pad(is_line, (k, 2 - k)) for k in range(3)]
+    return sides[0] | sides[1] | sides[2]
+
+
+def surface_tangents(points: Tensor, mask: Tensor, noise: Tensor, run: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Direction of the surface at every point, from a stretch that is long compared with the noise.
 
     Args:
         points: (B, N, 2) in beam order. mask: (B, N) points to use. noise: (B,) metres.
+        run: (B, N) of `surface_runs`, beyond which no surface extends; None: not known.
 
     Returns:
         (B, N, 2) unit vectors along the main axis of the neighbouring points, and (B, N) whether there is such an axis.
     """
     padded = nn.functional.pad(points, (0, 0, NEIGHBOURS, NEIGHBOURS)).unfold(1, 2 * NEIGHBOURS + 1, 1)  # (B, N, 2, W)
     real = nn.functional.pad(mask, (NEIGHBOURS, NEIGHBOURS)).unfold(1, 2 * NEIGHBOURS + 1, 1) & mask[..., None]
+    if run is not None:
+        numbers = nn.functional.pad(run, (NEIGHBOURS, NEIGHBOURS), value=-1).unfold(1, 2 * NEIGHBOURS + 1, 1)
+        real = real & (numbers == run[..., None])
     arm = padded.mT - points[..., None, :]  # (B, N, W, 2)
     squared = (arm**2).sum(-1)
     others = real & (torch.arange(2 * NEIGHBOURS + 1, device=points.device) != NEIGHBOURS)
