@@ -14,11 +14,14 @@ from torchcrf_scan.loops.jit import Array, Booleans, entry
 from torchcrf_scan.loops.rigid import apply, compose, inverse, motion_onto, rotate, transform_of, wrap
 from torchcrf_scan.loops.solve import axes_of
 from torchcrf_scan.prediction import LEAST_SHARE
-from torchcrf_scan.search.background import cost_of, refine
+from torchcrf_scan.search.background import cost_of, polish, refine, unit_length
 from torchcrf_scan.search.directions import Directions, directions_of
 from torchcrf_scan.search.grid import ScanGrid, grid_of
 
-ALIKE = 0.15  # units both ways, of ordinarily 1 to 2: motions whose costs differ by less explain the scans alike
+OPEN_SHARE = LEAST_SHARE / 2  # of information, below which a direction is open: not even three points in three hundred tell
+ALIKE = 0.4  # units both ways, of ordinarily 1 to 2: motions whose costs differ by less explain the scans alike
+ALIKE_TURNED = 0.2  # the same for motions that are turned against each other
+LARGE_TURN = 0.6  # radians against the guess; what has the same shape turned round, as a plain room, is checked for a smaller turn
 
 
 class Observed(NamedTuple):
@@ -38,7 +41,7 @@ class Observed(NamedTuple):
     @property
     def unobserved(self) -> Array:
         """(3, 3) projection on the directions that are not observed."""
-        rows = self.axes * (self.information < LEAST_SHARE)[:, None]
+        rows = self.axes * (self.information < OPEN_SHARE)[:, None]
         return rows.T @ rows
 
 
@@ -87,15 +90,23 @@ def settle(
     Where a direction is not observed, isolated returns in line with their neighbours are surface in the grids. explained: (P,).
     """
     seen = observe(source, motion, explained)
-    if not (seen.information < LEAST_SHARE).any():
+    if not (seen.information < OPEN_SHARE).any():
         return source, target, motion
     everything = np.ones(len(target.scan.points), np.bool_)
     there = observe(target, np.zeros(3), everything).surface
     source, target = straightened(source, seen.surface), straightened(target, there)
-    nearer = moved_towards(motion, guess, seen)
+    nearer = less_turned(source, target, moved_towards(motion, guess, seen), guess)
     nearer = moved_towards(refine(nearer[None], source, target)[0], guess, seen)
     is_alike = cost_of(nearer, source, target) <= cost_of(motion, source, target) + ALIKE
     return source, target, nearer if is_alike else motion
+
+
+def less_turned(source: ScanGrid, target: ScanGrid, motion: Array, guess: Array) -> Array:
+    """(3,) the motion (3,), or if it is far turned against the guess (3,) the registration from there, if that explains alike."""
+    if abs(wrap(motion[0] - guess[0])) < LARGE_TURN:
+        return motion
+    other = refine(polish(guess[None], source, target, unit_length(source.scan, target.scan)), source, target)[0]
+    return other if cost_of(other, source, target) <= cost_of(motion, source, target) + ALIKE_TURNED else motion
 
 
 def moved_towards(motion: Array, guess: Array, seen: Observed) -> Array:
