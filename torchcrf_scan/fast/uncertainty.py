@@ -9,7 +9,7 @@ import numpy as np
 
 from torchcrf_scan.fast.motion import POINT, Members, members_of, places_of
 from torchcrf_scan.fast.robust import robust_weight
-from torchcrf_scan.inference.uncertainty import EMPTY, MOST_CERTAIN, NOTHING, RUN, TINY, WITHIN
+from torchcrf_scan.inference.uncertainty import BENT, COARSE, EMPTY, MOST_CERTAIN, NOTHING, RUN, SHARED, TINY, WITHIN
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
 from torchcrf_scan.loops.rigid import rotate, transform, transform_of
 from torchcrf_scan.loops.solve import axes_of, inverse_of, product
@@ -113,7 +113,7 @@ class Sums(NamedTuple):
 
     Attributes:
         score: (P, 3) w J^T r of every point; step: (3,) their sum. normal: (3, 3) w J^T J, apart: (3, 3) w^2 J^T J, both symmetric.
-        total: of the weights. variance: of a residual.
+        total: of the weights. variance: of a residual. spread: mean squared residual.
     """
 
     score: Array
@@ -122,6 +122,7 @@ class Sums(NamedTuple):
     apart: Array
     total: float
     variance: float
+    spread: float
 
 
 @kernel
@@ -146,7 +147,19 @@ def sums_of(fit: Fit, noise: float) -> Sums:
     for r in range(3):
         for d in range(r):
             normal[r, d], apart[r, d] = normal[d, r], apart[d, r]
-    return Sums(score, step, normal, apart, max(total, 1e-9), max(2 * noise**2, squares / max(free, 1e-9)))
+    spread = squares / max(free, 1e-9)
+    return Sums(score, step, normal, apart, max(total, 1e-9), max(2 * noise**2, spread), spread)
+
+
+@kernel
+def shared_error(fit: Fit, places: Integers, spread: float, noise: float, surface: Directions) -> float:
+    """Squared error of a motion that all its points share; `inference.uncertainty`. places: (P,). spread: mean squared residual."""
+    sampled = free = 0.0
+    for p in range(len(places)):
+        share = fit.weights[p] * fit.freedom[p]
+        sampled, free = sampled + share * surface.spacing[places[p]] ** 2, free + share
+    beyond = spread - noise**2
+    return max(beyond if surface.step >= COARSE else SHARED**2 * (beyond - BENT**2 * sampled / max(free, 1e-9)), 0.0)
 
 
 @kernel
@@ -173,13 +186,14 @@ def projection_on(information: Array, directions: Array) -> Array:
 
 @kernel
 def cluster_covariance(
-    fit: Fit, places: Integers, motion: Array, metric: int, noise: float, reach: float
+    fit: Fit, places: Integers, motion: Array, metric: int, noise: float, reach: float, surface: Directions
 ) -> tuple[Array, Array, Array]:
     """(3, 3) covariance, (3,) information and (3, 3) directions of one motion, as `inference.uncertainty` defines them.
 
     Args:
         places: (P,) the cluster's points, ascending. motion: (3,). metric: POINT, else point-to-line.
         noise: standard deviation of a return. reach: largest distance of a source point from the sensor.
+        surface: of all source points.
     """
     sums = sums_of(fit, noise)
     normal, total = sums.normal, sums.total
@@ -200,7 +214,12 @@ def cluster_covariance(
     known[1, 1] += 1 / reach**2
     known[2, 2] += 1 / reach**2
     x, y = motion[1] - fit.centre[0], motion[2] - fit.centre[1]
-    return about_origin(inverse_of(known), fit.length, x, y), information, directions
+    local = inverse_of(known)
+    if metric != POINT:
+        shared = shared_error(fit, places, sums.spread, noise, surface)
+        for r in range(3):
+            local[r, r] += shared
+    return about_origin(local, fit.length, x, y), information, directions
 
 
 @kernel
@@ -251,7 +270,7 @@ def motion_covariance(
         places = places_of(association, cluster, c)
         members = members_of(source, target, tangents, association, places)
         fit = linearise(members, places, motions[c], metric, scale, noise, surface)
-        covariance[c], information[c], directions[c] = cluster_covariance(fit, places, motions[c], metric, noise, reach)
+        covariance[c], information[c], directions[c] = cluster_covariance(fit, places, motions[c], metric, noise, reach, surface)
     return covariance, information, directions
 
 

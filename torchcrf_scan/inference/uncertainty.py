@@ -4,10 +4,14 @@ A motion's errors come from more than the sensor's noise: returns sample a surfa
 and the fit stops early. So the covariance uses the larger of residuals and sensor noise, and is that of a sum of correlated
 scores (a sandwich estimator). Noise in the directions of surfaces must not count as information: along a corridor every noisy
 tangent seems to constrain the motion. Tangents are therefore estimated anew, from stretches long compared with the noise.
+
+Scans that are skewed, by turning while they are swept, fit none the better for more points: what is left of the residuals beyond noise
+and sampling tells how much, and is an error of the motion as a whole.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -26,6 +30,9 @@ RUN = 48  # neighbouring points with possibly correlated errors: a jolt lasts se
 NOTHING = 1e-3  # of a point's information, so that no matrix is singular
 TINY = 1e-6  # of the scene's extent: the least noise
 EMPTY = 1000.0  # noises: the extent of a scene without points, some ten metres
+SHARED = 4.0  # factor on the residual that noise and sampling do not explain, in an error that all points share,
+BENT = 0.05  # of the spacing: distance of a surface from the straight line between two returns, as sampling explains it
+COARSE = math.radians(4.0)  # between beams: neighbours do not sample a surface, and all of the residual is shared, with factor 1
 MISSING = 4.5  # beams; neighbours farther apart are not on one surface: whatever is between them returned nothing
 LEAST_TURN = 1e-9  # radians; several returns of one beam are not neighbouring beams
 STRAIGHT = 3.0  # noises that the middle one of three neighbours may be off the line through the others
@@ -44,8 +51,8 @@ def motion_covariance(
         1 / RUN sum over runs of points of (sum g) (sum g)^T     errors shared by neighbours
         (sum_i g_i) (sum_i g_i)^T                            the remaining step: the fit stopped before convergence.
 
-    Independent errors are counted up to twice, and errors hidden by the choice of partners are not counted;
-    `Calibration.covariance_factor` corrects for both. A direction with less information than `LEAST_SHARE` has only a prior: no
+    To it comes the error that all points share (`shared_error`), alike in all directions. Independent errors are counted up to twice,
+    and errors hidden by the choice of partners are not counted; `Calibration.covariance_factor` corrects for both. A direction with less information than `LEAST_SHARE` has only a prior: no
     point moves farther than the scene's extent, and a rotation is arbitrary. Differentiable at a fixed set of these directions.
     O(B C N).
 
@@ -80,8 +87,25 @@ def motion_covariance(
     length = at.length.double()
     prior = torch.stack([3 / (torch.pi * length) ** 2, *(1 / reach[:, None] ** 2).expand(2, *length.shape)], -1).diag_embed()
     local = torch.linalg.inv(bread @ torch.linalg.inv(meat) @ bread + prior)
+    if MOTION_METRICS[metric].along_surface:
+        local = local + shared_error(source, at, spread, noise)[..., None, None].double() * identity
     covariance = about_origin(local, length, (motions[..., 1:] - at.centre).double())
     return Uncertainty(covariance.to(source), information.to(source), vectors.mT.to(source))
+
+
+def shared_error(source: Tensor, at: Linearisation, spread: Tensor, noise: Tensor) -> Tensor:
+    """(B, C) squared error of the motions that all their points share: what noise and sampling do not explain of the residuals.
+
+    A coarse scan's points are partners of their own beams' next readings, which hides a part of the motion.
+
+    Args:
+        source: (B, N, 2). spread: (B, C) mean squared residual. noise: (B,).
+    """
+    step, near = usual_turn(source.detach()), spacing_of(source.detach())  # (B, 1), (B, N)
+    free = at.weights * at.freedom
+    sampled = (free * near[:, None] ** 2).sum(-1) / free.sum(-1).clamp(min=1e-9)
+    beyond = spread - noise[:, None] ** 2  # of a return
+    return torch.where(step >= COARSE, beyond, SHARED**2 * (beyond - BENT**2 * sampled)).clamp(min=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +154,7 @@ def moved_tangents(source: Tensor, support: Support, motions: Tensor, noise: Ten
 
     Far away, where a wall is seen at a grazing angle, its returns are isolated; in line with their neighbours they are no ends.
     """
-    run = surface_runs(source.detach())
+    run = surface_runs(source.detach(), noise)
     tangent, is_found = surface_tangents(source, support.weights.sum(1) > 0, noise, run)
     turned = se2.rotate(motions[..., :1], tangent[:, None])
     given = support.tangent[:, None]
@@ -162,20 +186,37 @@ def shared_scores(score: Tensor) -> Tensor:
     return (runs @ runs.mT / RUN).unflatten(0, score.shape[:2])
 
 
-def surface_runs(points: Tensor) -> Tensor:
-    """(B, N) ascending numbers of the runs of neighbouring beams of which few are missing; padding, at the sensor, belongs to none.
-
-    points: (B, N, 2) in beam order, as seen from the sensor.
-    """
+def turns_of(points: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, N-1) radians from a beam to the next, and whether both are real; padding lies at the sensor. points: (B, N, 2)."""
     here, there = points[:, :-1], points[:, 1:]
     cross = here[..., 0] * there[..., 1] - here[..., 1] * there[..., 0]
-    turn = torch.atan2(cross, (here * there).sum(-1)).abs()  # (B, N-1)
     real = (here != 0).any(-1) & (there != 0).any(-1)
-    if turn.shape[-1] == 0:
-        return torch.zeros_like(points[..., 0], dtype=torch.int64)
-    step = turn.masked_fill(~real | (turn < LEAST_TURN), torch.nan).nanmedian(-1, keepdim=True).values
-    is_apart = ~real | (turn > MISSING * step)
-    return torch.nn.functional.pad(is_apart.long().cumsum(-1), (1, 0))
+    return torch.atan2(cross, (here * there).sum(-1)).abs(), real
+
+
+def usual_turn(points: Tensor) -> Tensor:
+    """(B, 1) radians between beams, the lower median; NaN for fewer than two. points: (B, N, 2) in beam order."""
+    turn, real = turns_of(nn.functional.pad(points, (0, 0, 0, 2)))
+    return turn.masked_fill(~real | (turn < LEAST_TURN), torch.nan).nanmedian(-1, keepdim=True).values
+
+
+def surface_runs(points: Tensor, noise: Tensor) -> Tensor:
+    """(B, N) ascending numbers of the runs of neighbouring beams of which few are missing; padding belongs to none.
+
+    points: (B, N, 2) in beam order, as seen from the sensor. noise: (B,); neighbours a few noises apart are never cut.
+    """
+    turn, real = turns_of(points)
+    gap = torch.linalg.vector_norm(points.diff(dim=1), dim=-1)
+    is_apart = ~real | ((turn > MISSING * usual_turn(points)) & (gap > STRETCH * noise[:, None]))
+    return nn.functional.pad(is_apart.long().cumsum(-1), (1, 0))
+
+
+def spacing_of(points: Tensor) -> Tensor:
+    """(B, N) distance from a point to the nearer of its neighbours; 0 without one. points: (B, N, 2) in beam order."""
+    _, real = turns_of(points)
+    gap = torch.linalg.vector_norm(points.diff(dim=1), dim=-1).masked_fill(~real, torch.inf)
+    near = torch.minimum(*(nn.functional.pad(gap, side, value=torch.inf) for side in ((0, 1), (1, 0))))
+    return near.masked_fill(near == torch.inf, 0.0)
 
 
 def is_straight(points: Tensor, run: Tensor, noise: Tensor) -> Tensor:
@@ -187,7 +228,7 @@ def is_straight(points: Tensor, run: Tensor, noise: Tensor) -> Tensor:
     is_line = (off <= STRAIGHT * noise[:, None] * length) & (length > 0) & (run[:, :-2] == run[:, 2:])  # (B, N-2)
     if points.shape[1] < 3:
         return torch.zeros_like(points[..., 0], dtype=torch.bool)
-    sides = [torch.nn.functional.pad(is_line, (k, 2 - k)) for k in range(3)]
+    sides = [nn.functional.pad(is_line, (k, 2 - k)) for k in range(3)]
     return sides[0] | sides[1] | sides[2]
 
 

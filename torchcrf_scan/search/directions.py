@@ -17,28 +17,61 @@ class Directions(NamedTuple):
 
     Attributes:
         tangent: (N, 2). is_found: (N,) whether it is defined. is_straight: (N,) whether the point is in line with its neighbours.
+        spacing: (N,) distance to the nearer neighbour. step: radians between beams, NaN for one point.
     """
 
     tangent: Array
     is_found: Booleans
     is_straight: Booleans
+    spacing: Array
+    step: float
 
 
 @kernel
-def surface_runs(points: Array) -> Integers:
-    """(N,) ascending numbers of the runs of neighbouring beams of which few are missing. points: (N, 2) in beam order."""
-    N = len(points)
-    run, turn, turns, count = np.zeros(N, np.int64), np.zeros(N), np.empty(N), 0
-    for i in range(N - 1):
+def turns_of(points: Array) -> Array:
+    """(N,) radians from a beam to the next, 0 for the last. points: (N, 2) in beam order, as seen from the sensor."""
+    turn = np.zeros(len(points))
+    for i in range(len(points) - 1):
         x, y, u, v = points[i, 0], points[i, 1], points[i + 1, 0], points[i + 1, 1]
         turn[i] = abs(math.atan2(x * v - y * u, x * u + y * v))
+    return turn
+
+
+@kernel
+def usual_turn(turn: Array) -> float:
+    """Radians between beams, the lower median; NaN for fewer than two. turn: (N,) of `turns_of`."""
+    turns, count = np.empty(len(turn)), 0
+    for i in range(len(turn)):
         if turn[i] >= LEAST_TURN:
             turns[count] = turn[i]
             count += 1
-    step = lower_median(turns[:count]) if count > 0 else np.inf
-    for i in range(N - 1):
-        run[i + 1] = run[i] + (1 if turn[i] > MISSING * step else 0)
+    return lower_median(turns[:count]) if count > 0 else np.nan
+
+
+@kernel
+def surface_runs(points: Array, noise: float) -> Integers:
+    """(N,) ascending numbers of the runs of neighbouring beams of which few are missing.
+
+    points: (N, 2) in beam order. noise: of a range; neighbours a few noises apart are never cut.
+    """
+    run, turn = np.zeros(len(points), np.int64), turns_of(points)
+    step = usual_turn(turn)
+    for i in range(len(points) - 1):
+        gap = math.sqrt((points[i + 1, 0] - points[i, 0]) ** 2 + (points[i + 1, 1] - points[i, 1]) ** 2)
+        run[i + 1] = run[i] + (1 if turn[i] > MISSING * step and gap > STRETCH * noise else 0)
     return run
+
+
+@kernel
+def spacing_of(points: Array) -> Array:
+    """(N,) distance from a point to the nearer of its neighbours; 0 without one. points: (N, 2) in beam order."""
+    N = len(points)
+    near = np.zeros(N)
+    for i in range(N - 1):
+        gap = math.sqrt((points[i + 1, 0] - points[i, 0]) ** 2 + (points[i + 1, 1] - points[i, 1]) ** 2)
+        near[i] = min(near[i], gap) if i > 0 else gap
+        near[i + 1] = gap
+    return near
 
 
 @kernel
@@ -103,6 +136,7 @@ def surface_tangents(points: Array, mask: Booleans, noise: float, run: Integers)
 @kernel
 def directions_of(points: Array, mask: Booleans, noise: float) -> Directions:
     """Directions of the surfaces of (N, 2) points in beam order. mask: (N,) points to use."""
-    run = surface_runs(points)
+    run = surface_runs(points, noise)
     tangent, is_found = surface_tangents(points, mask, noise, run)
-    return Directions(tangent, is_found, is_straight(points, run, noise))
+    step = usual_turn(turns_of(points))
+    return Directions(tangent, is_found, is_straight(points, run, noise), spacing_of(points), step)
