@@ -10,7 +10,7 @@ import numpy as np
 from torchcrf_scan.fast.motion import POINT, Members, members_of, places_of
 from torchcrf_scan.fast.robust import robust_weight
 from torchcrf_scan.inference.uncertainty import BENT, COARSE, EMPTY, MOST_CERTAIN, NOTHING, RUN, SHARED, TINY, WITHIN
-from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
+from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.rigid import rotate, transform, transform_of
 from torchcrf_scan.loops.solve import axes_of, inverse_of, product
 from torchcrf_scan.prediction import LEAST_SHARE

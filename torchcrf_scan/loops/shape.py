@@ -76,7 +76,7 @@ def describe(points: Array, is_closed: bool) -> Shape:
 
 @kernel
 def _open_spacing(points: Array, into: Array) -> None:
-    """Writes metres (P,) between a point (P, 2) and the nearer of the next distinct ones on either side, so not across a depth jump.
+    """Writes metres (P,) between a point (P, 2) and the nearer of the next distinct ones on either side: not across a jump.
 
     The scan is regarded as open; 0 if all points coincide.
     """

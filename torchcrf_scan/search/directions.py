@@ -1,4 +1,4 @@
-"""Directions of the surfaces of a scan, from stretches that are long compared with the noise; `inference.uncertainty`."""
+"""Directions of the surfaces of a scan, from stretches that are long compared with the noise; `inference.directions`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.inference.uncertainty import LEAST_TURN, MISSING, NEIGHBOURS, STEPS, STRAIGHT, STRETCH
+from torchcrf_scan.inference.directions import LEAST_TURN, MISSING, NEIGHBOURS, STEPS, STRAIGHT, STRETCH
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.median import lower_median
 

@@ -114,7 +114,8 @@ def moved_towards(motion: Array, guess: Array, seen: Observed) -> Array:
     middle = apply(inverse(motion), seen.centre[None])
     shift = (apply(guess, middle) - seen.centre)[0]
     turn, x, y = seen.unobserved @ np.array([wrap(guess[0] - motion[0]) * seen.length, *shift])
-    step = motion_onto(turn / seen.length, *seen.centre, *(seen.centre + (x, y)))
+    there = seen.centre[0] + x, seen.centre[1] + y
+    step = motion_onto(turn / seen.length, *seen.centre, *there)
     return compose(step, motion)
 
 
