@@ -18,7 +18,7 @@ from torchcrf_scan.search.background import cost_of, polish, refine, unit_length
 from torchcrf_scan.search.directions import Directions, directions_of
 from torchcrf_scan.search.grid import ScanGrid, grid_of
 
-OPEN_SHARE = LEAST_SHARE / 2  # of information, below which a direction is open: not even three points in three hundred tell
+OPEN_SHARE = 0.75 * LEAST_SHARE  # of information, below which a direction is open: not even five points in three hundred tell
 ALIKE = 0.4  # units both ways, of ordinarily 1 to 2: motions whose costs differ by less explain the scans alike
 ALIKE_TURNED = 0.2  # the same for motions that are turned against each other
 LARGE_TURN = 0.6  # radians against the guess; what has the same shape turned round, as a plain room, is checked for a smaller turn
@@ -114,8 +114,8 @@ def moved_towards(motion: Array, guess: Array, seen: Observed) -> Array:
     middle = apply(inverse(motion), seen.centre[None])
     shift = (apply(guess, middle) - seen.centre)[0]
     turn, x, y = seen.unobserved @ np.array([wrap(guess[0] - motion[0]) * seen.length, *shift])
-    there = seen.centre[0] + x, seen.centre[1] + y
-    step = motion_onto(turn / seen.length, *seen.centre, *there)
+    at_x, at_y = seen.centre
+    step = motion_onto(turn / seen.length, at_x, at_y, at_x + x, at_y + y)
     return compose(step, motion)
 
 
