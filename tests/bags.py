@@ -110,7 +110,7 @@ def write(folder: Path, form: str, messages: Sequence[Message]) -> Path:
     place = folder / form.replace(" ", "_")
     plugin = StoragePlugin.MCAP if "mcap" in form else StoragePlugin.SQLITE3
     writer = Writer2(place, version=9, storage_plugin=plugin)
-    if form == "packed messages":
+    if form.startswith("packed messages"):
         writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
     with writer:
         _write_all(writer, STORES[2], messages, STORES[2].serialize_cdr)

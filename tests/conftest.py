@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
+LONG = {"test_export.py", "test_readme.py", "test_run_command.py"}
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # one of as many processes as there are cores: it has one, and so have its programs
@@ -28,6 +29,11 @@ def pytest_sessionstart() -> None:
     """The machine code is built once, before the processes start that share the tests."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
         subprocess.run([sys.executable, "-m", "torchcrf_scan.cli", "prepare"], cwd=Path(__file__).parents[1], check=True)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with tests of many seconds come first: nobody waits for them at the end, when the other tests are done."""
+    items.sort(key=lambda item: item.path.name not in LONG)
 
 
 @pytest.fixture(autouse=True)

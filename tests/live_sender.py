@@ -1,15 +1,11 @@
-"""A robot in a process of its own: sends scans over the loopback interface, and tells in JSON which answers came.
-
-python live_sender.py DOMAIN COUNT RATE [BAD ...]; BAD: numbers of scans whose bearings are of many turns.
-python live_sender.py DOMAIN COUNT LOG: the first scans of a log, at its own speed.
-"""
+"""A robot in a process of its own: sends scans over the loopback interface, and tells in JSON which answers came."""
 
 import json
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +21,17 @@ SPEED = 1.0  # metres a second
 PATIENCE, QUIET = 20.0, 2.0  # seconds to find each other, and without answers until there will be none
 
 
-def main(domain: int, messages: Iterable[tuple[float, Any]]) -> None:
+def drive(told: Path, domain: int, count: int, rate: float, *bad: int) -> None:
+    """A drive through a room; bad: numbers of scans whose bearings are of many turns."""
+    send(told, domain, ((k / rate, scan(k, k / rate, is_bad=k in bad)) for k in range(count)))
+
+
+def replay(told: Path, domain: int, count: int, log: Path) -> None:
+    """The first scans of a log, at its own speed."""
+    send(told, domain, messages_of(count, log))
+
+
+def send(told: Path, domain: int, messages: Iterable[tuple[float, Any]]) -> None:
     """messages: seconds and scan."""
     connection = Connection(Network(domain, (LOOPBACK,), LOOPBACK))
     writer, wheels = connection.writer("/scan", LASER), connection.writer("/wheels", ODOMETRY)
@@ -48,18 +54,13 @@ def main(domain: int, messages: Iterable[tuple[float, Any]]) -> None:
         gather(readers, answers)
         if sum(map(len, answers.values())) > came:
             came, last = sum(map(len, answers.values())), time.monotonic()
-    print(json.dumps(answers))
+    told.write_text(json.dumps(answers))
 
 
-def drive(count: int, rate: float, *bad: int) -> Iterator[tuple[float, Any]]:
-    for k in range(count):
-        yield k / rate, scan(k, k / rate, is_bad=k in bad)
-
-
-def replay(count: int, log: str) -> Iterator[tuple[float, Any]]:
+def messages_of(count: int, log: Path) -> Iterator[tuple[float, Any]]:
     """The scans of a log whose beams are a step apart, as messages."""
     begin = None
-    for reading in islice(read_scans(log), count):
+    for reading in islice(read_scans(str(log)), count):
         begin = reading.stamp if begin is None else begin
         whole, bearings = reading.scan, reading.scan.beam_bearings
         step = (whole.bearings[-1] - whole.bearings[0]) / (whole.beam[-1] - whole.beam[0])
@@ -104,8 +105,3 @@ TOLD = {
     "scan_moving": blanks,
     "scan_labels": lambda message: [stamp(message), *message.intensities],
 }
-
-if __name__ == "__main__":
-    domain, count, source, *bad = sys.argv[1:]
-    is_rate = source.replace(".", "").isdigit()
-    main(int(domain), drive(int(count), float(source), *map(int, bad)) if is_rate else replay(int(count), source))

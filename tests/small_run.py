@@ -1,13 +1,9 @@
-"""A first-order run of seconds, for tests that kill it or share it out; also a program of its own, which writes its losses:
-
-python small_run.py FOLDER [--kill-after STEP] [--kill-in-write STEP] [--GRADIENT_SETTING VALUE ...]
-"""
+"""A first-order run of seconds, for tests that kill it or share it out."""
 
 import argparse
 import json
 import os
 import signal
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,6 +86,7 @@ def kill_in_write(step: int) -> None:
 
 
 def main(arguments: list[str]) -> None:
+    """A run that writes its losses: FOLDER [--kill-after STEP] [--kill-in-write STEP] [--GRADIENT_SETTING VALUE ...]."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kill-after", type=int)
@@ -105,7 +102,3 @@ def main(arguments: list[str]) -> None:
         if ranks.is_first:
             curve = {"loss": [report.terms["total"] for report in watcher.reports], "validation": watcher.validations}
             (known.folder / "curve.json").write_text(json.dumps(curve))
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -2,11 +2,12 @@
 
 import errno
 import os
+import resource
 from pathlib import Path
 
 import pytest
 
-from torchcrf_scan.whole_file import write_whole
+from torchcrf_scan.whole_file import whole_path, write_whole
 
 
 def fail(*_: object) -> None:
@@ -31,14 +32,25 @@ def test_what_cannot_be_written_leaves_the_file_before(call: str, tmp_path: Path
     assert [of.name for of in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_disk_that_is_full_in_earnest(tmp_path: Path) -> None:
-    full = Path("/dev/full")
-    if not full.exists():
-        pytest.skip("needs /dev/full")
+def test_a_file_too_large_in_earnest(tmp_path: Path) -> None:
     path = tmp_path / "file"
     write_whole(path, b"good")
-    (tmp_path / f".file.{os.getpid()}").symlink_to(full)
-    with pytest.raises(OSError, match="No space left on device"):
-        write_whole(path, b"x" * 100_000)
+    least, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, most))
+    try:
+        with pytest.raises(OSError, match=r"File too large: '.*file'$"):
+            write_whole(path, b"x" * 100_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (least, most))
     assert path.read_bytes() == b"good"
     assert [of.name for of in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_pipe_or_device_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="pipe: expected a file to write, got a device or pipe"):
+        write_whole(tmp_path / "pipe", b"x")
+    with pytest.raises(OSError, match="got a device or pipe"), whole_path(tmp_path / "pipe"):
+        pass
+    assert (tmp_path / "pipe").is_fifo()
+    assert [of.name for of in tmp_path.iterdir()] == ["pipe"]

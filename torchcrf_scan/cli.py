@@ -57,6 +57,7 @@ POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: metavar,
 }
 
 FLAGS: Mapping[str, str] = {  # parameter that is true or false: help
+    "causes": "also tell where wrong points come from, what became of every mover, and what oracles would save (method joint)",
     "use_odometry": "take the log's odometry as the first guess of the sensor's motion",
     "clean": "also write the log again without the beams that hit moving objects, and a bag with the odometry found",
     "visualize": "show everything in the viewer of rerun while it is computed (extra `viewer`)",
@@ -77,7 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         options = parser.instantiate(parsed)[parsed.command]
         code = COMMANDS[parsed.command](**arguments_of(COMMANDS[parsed.command], vars(options)))
-        sys.stdout.flush()
+        if sys.stdout is not None:  # closed before we began (`>&-`)
+            sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output closed the pipe (`| head`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -113,7 +115,8 @@ def _command_parser(name: str, command: Callable[..., int], summary: str) -> Arg
     """Options from the signature; parameters in `POSITIONAL` become positional arguments, those in `FLAGS` take no value."""
     parameters = inspect.signature(command).parameters
     forms = {key: metavar + (" ..." if count else "") for key, (metavar, count, _) in POSITIONAL.items()}
-    shown = [form for key, form in {**forms, "output": "--output OUTPUT"}.items() if key in parameters]
+    forms |= {"output": "--output OUTPUT"}
+    shown = [form for key, form in forms.items() if key in parameters and parameters[key].default is inspect.Parameter.empty]
     parser = ArgumentParser(description=summary, usage=" ".join(["torchcrf-scan", name, *shown, "[options]"]))
     for key, (metavar, count, meaning) in POSITIONAL.items():
         if key in parameters:

@@ -10,7 +10,6 @@ are plain named tensors, as runtimes need them.
 from __future__ import annotations
 
 import copy
-import os
 from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.variants import sweep
+from torchcrf_scan.whole_file import whole_path
 
 OPSET = 18  # ONNX opset
 FROM_BATCH = (
@@ -158,14 +158,12 @@ def export_onnx(path: str | Path, program: ExportedProgram) -> None:
 
     Inputs are `decoder_inputs`, outputs `OUTPUTS`; the indices of impossible candidates may differ from the model's.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     names = list(OUTPUTS)
     # not simplified here, which takes minutes: a runtime does it in a second when it loads the file
     written = torch.onnx.export(program, opset_version=OPSET, output_names=names, dynamo=True, optimize=False, verbose=False)
     assert written is not None
-    written.save(temporary)
-    os.replace(temporary, path)
+    with whole_path(Path(path)) as beside:
+        written.save(beside)
 
 
 class PlainOperators(TorchFunctionMode):

@@ -17,6 +17,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.choices import STARTS
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.encoder.encoder import ScanEncoder
+from torchcrf_scan.evaluation.causes.trace import SearchTrace
 from torchcrf_scan.fast.arrays import fitted_of, settings_of
 from torchcrf_scan.fast.choice import can_decode
 from torchcrf_scan.fast.pairs import by_beam, decode_pairs, extras_of, predict
@@ -38,6 +39,8 @@ from torchcrf_scan.search.accept import score_of
 from torchcrf_scan.search.expected import Expected
 from torchcrf_scan.search.pairs import initialise, start_pairs
 from torchcrf_scan.search.score import HypothesisScore
+from torchcrf_scan.search.survey import Survey
+from torchcrf_scan.search.trace import trace_of
 from torchcrf_scan.variants import sweep
 from torchcrf_scan.variants.register import BEGINNINGS, DECODERS, LIKELIHOODS
 
@@ -323,24 +326,45 @@ class JointScanCRF(nn.Module):
             found += self._match(pairs[begin : begin + batch_size])
         return found
 
-    def _match(self, pairs: Sequence[ScanPair], expected: Expected | None = None) -> list[PairPrediction]:
+    @torch.no_grad()
+    def trace_pairs(self, pairs: Sequence[ScanPair], batch_size: int = 16) -> list[tuple[PairPrediction, SearchTrace]]:
+        """Predictions as those of `match_pairs`, each with what became of the search's hypotheses.
+
+        Raises:
+            ValueError: settings or a device for which the loops do not answer (`inference.backend`).
+        """
+        found: list[tuple[PairPrediction, SearchTrace]] = []
+        for begin in range(0, len(pairs), batch_size):
+            record: list[SearchTrace] = []
+            found += zip(self._match(pairs[begin : begin + batch_size], record=record), record, strict=True)
+        return found
+
+    def _match(
+        self, pairs: Sequence[ScanPair], expected: Expected | None = None, record: list[SearchTrace] | None = None
+    ) -> list[PairPrediction]:
         """Predictions of one batch of pairs: in arrays throughout where the loops compute the rounds, else in padded tensors.
 
-        expected: of a single pair.
+        expected: of a single pair. record: gets the trace of every pair's search.
         """
         reference = self.association_weights["sequence"]
         has_embeddings = self.config.encoder.embedding > 0
         if not (STARTS[self.config.start].in_loops and can_decode(self.config, reference.device, has_embeddings=has_embeddings)):
+            if record is not None:
+                raise ValueError("trace: expected a model whose start and rounds the loops compute, on a CPU, got another")
             prediction = self(ScanPairBatch.collate(pairs, reference.dtype).without_truth().to(reference.device))
             return [prediction.pair(b, pair) for b, pair in enumerate(pairs)]
         scans = [pair_of_scans(pair, reference.dtype) for pair in pairs]
-        starts = start_pairs(scans, score_of(self.hypothesis_score), self.config.motions, expected)
+        score, surveys = score_of(self.hypothesis_score), None if record is None else list[Survey | None]()
+        starts = start_pairs(scans, score, self.config.motions, expected, surveys)
         extras = extras_of(
             [len(pair.source) for pair in scans], None if self.encoder is None else self.encoder.of_pairs(scans, starts)
         )
         if expected is not None:
             extras = [extras[0].plus_moving(expected.log_moving)]
         answers = decode_pairs(scans, starts, extras, fitted_of(self.fitted), settings_of(self.config))
+        if record is not None and surveys is not None:
+            seen = zip(scans, surveys, answers, strict=True)
+            record += [trace_of(scan, survey, score, answer.active) for scan, survey, answer in seen]
         return [by_beam(answer, pair) for answer, pair in zip(answers, pairs, strict=True)]
 
     def save_pretrained(self, folder: str | Path) -> None:

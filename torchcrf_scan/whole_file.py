@@ -1,8 +1,12 @@
-"""Atomic writing of files: to a temporary file in the same folder, flushed to the disk, then renamed."""
+"""Atomic writing of files: to a temporary file in the same folder, flushed to the disk, then renamed.
+
+The temporary file has a name that nobody can guess, and is new: no link is followed.
+"""
 
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,13 +25,15 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     """
     temporary = _beside(path)
     try:
-        with temporary.open("wb") as file:
+        with temporary.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None and error.errno is not None:  # of a write, e.g. a full disk
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise
     _sync(path.parent)
 
@@ -52,7 +58,10 @@ def whole_path(path: Path) -> Iterator[Path]:
 
 
 def _beside(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}")
+    """A name in the same folder; raises OSError where a device or pipe would be replaced, such as /dev/null by a superuser."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(f"{path}: expected a file to write, got a device or pipe")
+    return path.with_name(f".{path.name}.{secrets.token_hex(8)}")
 
 
 def _sync(folder: Path) -> None:

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from forked import CONTEXT
 
 from torchcrf_scan import JointScanCRF, ModelConfig, PairPrediction, Scan, ScanPair
 from torchcrf_scan.cli import main
+from torchcrf_scan.commands import apart
 from torchcrf_scan.data.carmen import bearings_of
 
 
@@ -55,6 +57,12 @@ def real_logs_dir() -> Path:
     if not any(folder.glob("*.log.gz")):
         pytest.skip(f"needs the recorded logs, which are not part of the repository: nothing in {folder}")
     return folder
+
+
+@pytest.fixture
+def fast_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Outputs apart are made in processes that begin at once; to begin one as users do takes seconds."""
+    monkeypatch.setattr(apart.multiprocessing, "get_context", lambda kind: CONTEXT)
 
 
 @pytest.fixture

@@ -68,6 +68,7 @@ def test_every_result_arrives_in_order_in_another_process(tmp_path: Path, monkey
     assert held_signals() == held
 
 
+@pytest.mark.usefixtures("fast_start")
 @pytest.mark.parametrize(
     ("fault", "expected"),
     [("disk", "out: disk full"), ("dies", "out: its process ended early, with exit code -9"), ("end", "out: nothing to show")],

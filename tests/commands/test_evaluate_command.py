@@ -16,6 +16,7 @@ from torchcrf_scan.commands.evaluate import METHODS
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.pair_file import read_pair, read_prediction, write_pair, write_prediction
 from torchcrf_scan.evaluation.metrics import score_pair
+from torchcrf_scan.evaluation.neighbours import NeighbourScore, summarise_neighbours
 from torchcrf_scan.evaluation.summary import summarise
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -112,15 +113,16 @@ def test_tables_have_a_row_for_every_sequence_and_for_all(
     assert run("evaluate", pairs_dir, "--predictions", predictions_dir) == 0
     out = capsys.readouterr().out
     titles = [line.strip("*").split(":")[0] for line in out.splitlines() if line.startswith("**")]
-    assert titles == ["Overview", "Table I", "Table II", "Table III", "How sure"]
+    tables = ["Overview", "Table I", "Table II", "Table III", "How sure", "Scene flow", "Moving points and movers"]
+    assert titles == [*tables, "Errors by range"]
     for row in ("predictions, sim3_0", "predictions, sim3_1", "predictions, all"):
-        assert out.count(f"| {row} |") == 5
+        assert out.count(f"| {row} |") == 7
 
 
 def test_one_sequence_needs_one_row(pairs_dir: Path, predictions_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("evaluate", f"{pairs_dir}/sim_s0_*.npz", "--predictions", predictions_dir) == 0
     out = capsys.readouterr().out
-    assert out.count("| predictions, all |") == 5
+    assert out.count("| predictions, all |") == 7
     assert "sim3_0" not in out
 
 
@@ -136,7 +138,19 @@ def test_figures_tell_how_sure_the_model_is(
         assert group["nees_low"] < 3 < group["nees_high"]
     keys = ("association_ece", "cluster_ece", "nees_covered", "nees_mean", "nees_low", "nees_high")
     cells = [f"{figures['all'][key]:.{digits}f}" for key, digits in zip(keys, (1, 1, 1, 2, 2, 2), strict=True)]
-    assert out.splitlines()[-1] == f"| predictions, all | {' | '.join(cells)} |"
+    assert f"| predictions, all | {' | '.join(cells)} |" in out.splitlines()
+
+
+def test_figures_hold_scene_flow_and_ranges(
+    pairs_dir: Path, predictions_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, figures = evaluate(capsys, tmp_path / "f.json", pairs_dir, "--predictions", predictions_dir)
+    for group in (figures["all"], *figures["sequences"].values()):
+        assert group["epe_background"] >= 0
+        assert group["epe_standing"] is None  # nobody stands still in simulated streets but what is background
+        assert 0 <= group["accuracy_strict"] <= group["accuracy_relaxed"] <= 100
+    assert sum(row["points"] for row in figures["ranges"].values()) > 0
+    assert f"| {figures['all']['speed_iou']:.1f} |" in out
 
 
 def test_predictions_that_do_not_say_how_well_motions_are_known(
@@ -148,7 +162,8 @@ def test_predictions_that_do_not_say_how_well_motions_are_known(
         write_prediction(tmp_path / path.name, replace(prediction, covariances=None, unobserved_turn=None, unobserved_shift=None))
     out, figures = evaluate(capsys, tmp_path / "f.json", pairs_dir, "--predictions", tmp_path)
     _, whole = evaluate(capsys, tmp_path / "w.json", pairs_dir, "--predictions", predictions_dir)
-    assert out.splitlines()[-1].endswith(" | - | - | - | - |")
+    how_sure = out.split("**How sure**")[1].split("**Scene flow**")[0]
+    assert how_sure.splitlines()[-2].endswith(" | - | - | - | - |")
     assert {key for key, value in figures["all"].items() if value != whole["all"][key]} == {
         *("nees_pairs", "nees_covered", "nees_mean", "nees_low", "nees_high")
     }
@@ -171,7 +186,8 @@ def test_other_methods(pairs_dir: Path, model_dir: Path, tmp_path: Path, method:
     out, figures = evaluate(capsys, tmp_path / "f.json", pairs_dir, "--method", method, "--model", model_dir)
     pairs = list(PairFiles(pairs_dir))
     answers = METHODS[method](lambda: JointScanCRF.from_pretrained(model_dir))(pairs)
-    expected = summarise([score_pair(pair, answer) for pair, answer in zip(pairs, answers, strict=True)])
+    both = list(zip(pairs, answers, strict=True))
+    expected = summarise([score_pair(*of) for of in both]) | summarise_neighbours([NeighbourScore.of(*of) for of in both])
     found = {key: np.nan if value is None else value for key, value in figures["all"].items()}
     assert found == pytest.approx(expected, nan_ok=True)
     assert f"| {method}, all |" in out

@@ -13,5 +13,11 @@ def test_it_says_where_the_machine_code_lies(capsys: pytest.CaptureFixture[str])
     assert machine.missing(machine.processor_level()) == []
 
 
-def test_an_unknown_level_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "expected some of x86-64-v2, x86-64-v3, generic, got avx9" in fail(capsys, "prepare", "--levels=[avx9]")
+@pytest.mark.parametrize("levels", ["avx9", "[avx9]", "[generic,avx9]"])
+def test_an_unknown_level_is_an_error(capsys: pytest.CaptureFixture[str], levels: str) -> None:
+    assert "expected some of x86-64-v2, x86-64-v3, generic, got avx9" in fail(capsys, "prepare", f"--levels={levels}")
+
+
+def test_a_closed_stdout_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout", None)
+    assert run("prepare") == 0

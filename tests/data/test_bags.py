@@ -2,6 +2,7 @@
 
 import sqlite3
 import struct
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,14 @@ def test_a_bag_without_scans_tells_what_it_has(tmp_path: Path) -> None:
     expected = r"sensor_msgs/LaserScan or sensor_msgs/PointCloud2, got /odom \(nav_msgs/Odometry\)"
     with pytest.raises(ValueError, match=rf"run\.bag: topic: expected a topic of type {expected}"):
         next(read_scans(path))
+
+
+@pytest.mark.parametrize("name", ["/odom", "auto"])
+def test_odometry_that_is_not_there_is_told(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path, "ros1", drive(2))
+    expected = r"expected a topic of type nav_msgs/Odometry, got /scan \(sensor_msgs/LaserScan\)$"
+    with pytest.raises(ValueError, match=rf"run\.bag: odometry: {expected}"):
+        next(read_scans(path, odometry=name))
 
 
 # --- messages -----------------------------------------------------------------------------------------------------------------
@@ -219,6 +228,25 @@ def test_a_message_that_is_cut_is_named(tmp_path: Path) -> None:
     assert f"{path}, row 4: expected a {LASER}, got" in fault
 
 
+@pytest.mark.parametrize("form", ["packed messages", "packed messages mcap"])
+@pytest.mark.parametrize("odometry", [None, "auto"])
+def test_a_damaged_packed_message_is_one_bad_scan(tmp_path: Path, form: str, odometry: str | None) -> None:
+    path, told = write(tmp_path, form, [*drive(9), *(wheels(9) if odometry else [])]), list[ValueError]()
+    (part,) = (file for file in path.iterdir() if file.suffix != ".yaml")
+    data, start = part.read_bytes(), b"\x28\xb5\x2f\xfd"
+    assert data.count(start) >= 9
+    at = [k for k in range(len(data)) if data.startswith(start, k)]
+    large = [k for k, after in zip(at, [*at[1:], len(data)], strict=True) if after - k > 500]
+    part.write_bytes(data[: large[4]] + bytes(16) + data[large[4] + 16 :])
+    readings = list(read_scans(path, odometry=odometry, on_bad=told.append))
+    assert len(readings) == 8
+    (error,) = told
+    assert f"{part}, r" in str(error)
+    assert "expected data that can be unpacked" in str(error)
+    with pytest.raises(ValueError, match="expected data that can be unpacked"):
+        list(read_scans(path, odometry=odometry))
+
+
 def test_folders_with_wrong_metadata(tmp_path: Path) -> None:
     path = write(tmp_path, "sqlite", drive(2))
     next(file for file in path.iterdir() if file.suffix == ".db3").rename(path / "other.db3")
@@ -255,6 +283,17 @@ def test_a_chunk_that_is_larger_than_it_says_is_refused(compression: str) -> Non
         bag_records.unpack(b"nothing of the kind", compression, 1000)
     with pytest.raises(ValueError, match="expected compression by bz2, lz4, zstd or none, got 'zip'"):
         bag_records.unpack(packed, "zip", 1000)
+
+
+@pytest.mark.parametrize(("form", "library"), [("ros1 lz4", "lz4"), ("packed messages", "backports"), ("mcap", "rosbags")])
+def test_a_library_that_is_missing_is_named(tmp_path: Path, form: str, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path, form, drive(2))
+    for name in [name for name in sys.modules if name.split(".")[0] in (library, "compression")]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in (library, "compression"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ValueError, match=rf"expected the library {library}.* \(extra `ros`\), got"):
+        list(read_scans(path))
 
 
 def zstd_of(data: bytes) -> bytes:

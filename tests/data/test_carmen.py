@@ -180,7 +180,7 @@ def test_the_log_shows_what_means_nothing(tmp_path: Path, nothing: float) -> Non
 # --- faults -------------------------------------------------------------------------------------------------------------------
 
 BROKEN = ["FLASER three 1 2 3", "FLASER 3 1 2", "FLASER 2 1.0 x 0 0 0 0 0 0 0 h 0", "FLASER ", "FLASER 2 1.0 2.0 0 0 0",
-          "FLASER -1 0 0 0 0 0 0 0 h 0", "FLASER 1 1,5 0 0 0 0 0 0 0 h 0", "FLASER 1 1 0 0 nan 0 0 0 0 h 0",
+          "FLASER -1 0 0 0 0 0 0 0 h 0", "FLASER 1 1,5 0 0 0 0 0 0 0 h 0", "FLASER 1 1 0 0 0 0 0 0 nan h 0",
           f"FLASER {10**6} 1 0 0 0 0 0 0 0 h 0"]  # fmt: skip
 
 
@@ -291,3 +291,13 @@ def test_a_cut_line_or_file_ends_the_reading(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=r"line \d \(byte"):
             list(read_carmen(tmp_path / name, ReadOptions(on_bad=told.append)))
     assert told == []
+
+
+def test_a_pose_that_is_not_finite_is_unknown(tmp_path: Path) -> None:
+    path = tmp_path / "run.log"
+    path.write_text(
+        "FLASER 1 2.0 1 2 nan nan nan nan 0.1 h 0.1\nFLASER 1 2.0 nan 2 0 1 inf 0 0.2 h 0.2\nFLASER 1 2 1 2 3 1 2 3 0.3 h 0.3\n"
+    )
+    first, second, third = read_carmen(path)
+    assert (first.pose, first.odometry, second.pose, second.odometry) == (None, None, None, None)
+    assert (third.pose.tolist(), third.odometry.tolist()) == ([3, 1, 2], [3, 1, 2])

@@ -33,6 +33,8 @@ def test_odometry_columns(tmp_path: Path) -> None:
     pair = read_recording(path)[0]
     np.testing.assert_allclose(pair.initial_motion, [-0.1, -0.2 * np.cos(0.1), 0.2 * np.sin(0.1)])
     assert pair.source.beam.tolist() == [1, 0]
+    path = save(tmp_path, "stamp,odom_theta,odom_x,odom_y,1.0,0.5", "0,0,nan,0,2,2", "0.1,,,,2,2")
+    assert [reading.odometry for reading in read_scans(path)] == [None, None]
 
 
 @pytest.mark.parametrize(
@@ -40,7 +42,7 @@ def test_odometry_columns(tmp_path: Path) -> None:
     [
         ([HEAD, "0,1,2,3", "1,1,2"], r"line 3 \(byte 29\): expected 4 fields, got 3"),
         ([HEAD, "0,1,2,3", "1,1,two,3"], "line 3 .*: expected numbers, got"),
-        ([HEAD, "0,1,2,3", ",1,2,3"], "line 3 .*: expected a finite stamp"),
+        ([HEAD, "0,1,2,3", ",1,2,3"], "line 3 .*: expected a finite stamp, got"),
         (["stamp,a,b", "0,1,2"], "line 1 .*: expected bearings of one turn in radians behind stamp"),
         (["stamp,-90,0,90", "0,1,2,3"], "are these degrees"),
         (["stamp,", "0,1"], "line 1"),

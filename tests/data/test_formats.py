@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from torchcrf_scan.data.carmen import read_carmen
-from torchcrf_scan.data.formats import FORMATS, PAIR, find_format, is_recording, read_recording, read_scans
+from torchcrf_scan.data.formats import FORMATS, find_format, read_recording, read_scans
+from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.scan import Scan, ScanPair
 
@@ -33,11 +34,9 @@ def name_of(path: Path) -> str | None:
         (b"\x89MCAP0\r\n\1", "MCAP file"),
         (b"SQLite format 3\0", "ROS 2 database"),
         (b"PK\3\4", "pair file"),
-        (b"", None),
         (b"  \n", None),
         (b"\x93NUMPY\1\0", None),
         (pickle.dumps([1, 2]), None),
-        (b"\x1f\x8b\x08\0", None),
         (bytes(1000), None),
     ],
 )
@@ -46,11 +45,22 @@ def test_a_file_is_known_by_its_content(tmp_path: Path, content: bytes, name: st
     path = tmp_path / file
     path.write_bytes(content)
     assert name_of(path) == name
-    assert is_recording(path) == (name not in (None, PAIR.name))
     if name is None:
         with pytest.raises(ValueError, match=r": expected one of pair file, ROS 1 bag, .*, got none of these$") as error:
             read_scans(path)
         assert "pickle" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"#ROSBAG V2", b"\x89MCAP", b"SQLite format", b"P", b"\x1f\x8b\x08\0", gzip.compress(CARMEN.encode())[:15]]
+)
+def test_a_file_that_ends_before_its_format_is_known(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "run.bag"
+    path.write_bytes(content)
+    got = f"a file that is cut after {len(content)} bytes" if content else "an empty file"
+    assert find_format(path) is None
+    with pytest.raises(ValueError, match=rf"run\.bag: expected one of pair file, .*, got {got}$"):
+        read_scans(path)
 
 
 def test_a_folder_is_known_by_its_metadata(tmp_path: Path) -> None:
@@ -73,11 +83,49 @@ def test_a_recording_has_the_pairs_of_consecutive_scans(tmp_path: Path) -> None:
     assert [reading.stamp for reading in read_scans(path)] == [reading.stamp for reading in read_carmen(path)]
 
 
+def test_a_malformed_line_is_left_out_of_the_pairs_on_request(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, told = tmp_path / "run.log", list[ValueError]()
+    lines = [READING.format(stamp=k / 10) for k in range(4)]
+    path.write_text("".join([*lines[:2], "FLASER 3 1.00 two 1.20\n", *lines[2:]]))
+    recording = read_recording(path, ReadOptions(on_bad=told.append))
+    assert len(list(recording)) == len(list(recording)) == 3
+    assert (len(told), recording.fault, caplog.text) == (1, None, "")
+    assert len(ended := read_recording(path)) == 1
+    assert str(ended.fault) == str(told[0])
+
+
 def test_one_scan_makes_no_pair(tmp_path: Path) -> None:
     path = tmp_path / "run.log"
     path.write_text(READING.format(stamp=0.0))
     with pytest.raises(ValueError, match=r"run\.log: expected at least two scans, got one$"):
         read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "options", "name"),
+    [
+        ("stamp,0.0,0.1\n0,1,2\n", {"topic": "/scan"}, "topic"),
+        ("stamp,0.0,0.1\n0,1,2\n", {"odometry": "/odom"}, "odometry"),
+        (CARMEN, {"odometry": "/odom"}, "odometry"),
+    ],
+)
+def test_options_without_meaning_are_refused(tmp_path: Path, content: str, options: dict[str, str], name: str) -> None:
+    path = tmp_path / "run"
+    path.write_text(content)
+    told = rf"run: {name}: expected none, as this is a C[\w ]+, got {options[name]}$"
+    with pytest.raises(ValueError, match=told):
+        read_scans(path, **options)
+    with pytest.raises(ValueError, match=told):
+        read_recording(path, ReadOptions(**options))
+    assert len(list(read_scans(path, odometry="auto", no_return=50.0)))
+
+
+def test_a_pair_file_takes_no_options(tmp_path: Path) -> None:
+    scan = Scan.from_ranges([1.0, 2.0], [0.2, 0.1])
+    write_pair(tmp_path / "pair.npz", ScanPair(scan, scan, 0.25))
+    for options in ({"topic": "/scan"}, {"no_return": 8.0}):
+        with pytest.raises(ValueError, match=r"pair\.npz: \w+: expected none, as this is a pair file, got"):
+            read_scans(tmp_path / "pair.npz", **options)
 
 
 def test_a_pair_file_is_two_scans(tmp_path: Path) -> None:

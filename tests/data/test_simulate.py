@@ -196,6 +196,14 @@ def test_aperture_shows_one_side_that_slides_along_itself():
     assert n_sliding >= 6
 
 
+def test_somebody_passes_near_a_standing_sensor():
+    pairs = simulate_pairs(NAMED_WORLDS["passed_512"], 12, 12, 0)
+    assert all((pair.annotation.motions[0] == 0).all() for pair in pairs)
+    near = [np.hypot(*pair.source.points[pair.annotation.body > 0].T).min(initial=np.inf) for pair in pairs]
+    assert np.median(near) < 1.2
+    assert min(near) > 0.3
+
+
 def test_what_stands_still_is_static():
     config = SimulatorConfig(dt=0.001, movers_min=4)  # 15 m/s is 1.5 cm in a millisecond
     for pair in simulate_pairs(config, 4, 4, 0):

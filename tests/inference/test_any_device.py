@@ -18,7 +18,7 @@ ELSEWHERE = torch.device("meta")  # a device without values, so that a test need
 
 
 def annotated() -> ScanPairBatch:
-    return ScanPairBatch.collate(simulate_pairs(SimulatorConfig(beams=31), 2, 1, 0))
+    return ScanPairBatch.collate(simulate_pairs(SimulatorConfig(beams=16), 2, 1, 0))
 
 
 def moved(mode: FakeTensorMode, given: Any) -> Any:

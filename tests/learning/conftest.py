@@ -1,6 +1,10 @@
 """A study of six small pairs and the models of one of its folds, made once for all tests of the experiment."""
 
+from collections.abc import Iterator
+
 import pytest
+from matplotlib.figure import Figure
+from torch.utils.tensorboard import SummaryWriter
 
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
@@ -37,3 +41,18 @@ def study(small_pairs: list[ScanPair], small_config: RunConfig) -> Study:
 def models(study: Study, small_config: RunConfig) -> Models:
     """Fitted on the first four pairs."""
     return fit_models(study, range(4), small_config, variants=True)
+
+
+@pytest.fixture(scope="module")
+def drawn_once() -> Iterator[None]:
+    """Drawing takes time: of the figures of one name the first is drawn for TensorBoard, the others are blank."""
+    drawn: set[str] = set()
+    real = SummaryWriter.add_figure
+
+    def add(writer: SummaryWriter, tag: str, figure: Figure, step: int, close: bool) -> None:
+        real(writer, tag, Figure((0.2, 0.2)) if tag in drawn else figure, step, close)
+        drawn.add(tag)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SummaryWriter, "add_figure", add)
+        yield

@@ -1,13 +1,11 @@
 """Leave-one-out: what every fold may see, what is on disk when, and several processes that end as one."""
 
 import os
-import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from forked import run_ranks
 from hypothesis import given
 from hypothesis import strategies as st
 from made_up import RIVAL, Recorder, guess, make_pairs, make_study
@@ -203,40 +201,13 @@ def test_a_method_that_a_fold_lacks_is_no_row(tmp_path: Path) -> None:
 
 # --- several processes --------------------------------------------------------------------------------------------------------
 
-SCRIPT = """
-import os, sys
-from pathlib import Path
-from made_up import Recorder, make_pairs, make_study
-from torchcrf_scan.experiment.settings import RunConfig
-from torchcrf_scan.experiment.cross_validation import make_folds, run_folds
-rank, pairs, recorder = os.environ["RANK"], make_pairs(*"aabc"), Recorder()
-recorder.install()
-protocols = ("leave_one_pair_out", "leave_one_sequence_out")
-folds = {protocol: make_folds(protocol, pairs, 4) for protocol in protocols}
-run_folds(lambda jobs: make_study(pairs), folds, RunConfig(), Path(sys.argv[1]) / rank, 1)
-print(len(recorder.trained))
-"""
 
-
-def start_ranks(folder: Path) -> list[int]:
-    """Two processes as `torchrun` starts them, each with a disk of its own; how many folds each ran."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    shared = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2"}
-    shared |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", SCRIPT, str(folder)]
-    ranks = [
-        subprocess.Popen(command, env={**shared, "RANK": rank}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for rank in "01"
-    ]
-    try:
-        ended = [process.communicate(timeout=120) for process in ranks]
-    finally:
-        for process in ranks:
-            process.kill()
-    assert [process.returncode for process in ranks] == [0, 0], ended
-    return [int(out) for out, _ in ended]
+def run_rank(folder: Path) -> None:
+    """A process of two, with a disk of its own: writes down how many folds it ran."""
+    rank, pairs, recorder = os.environ["RANK"], make_pairs(*"aabc"), Recorder()
+    recorder.install()
+    run_folds(lambda jobs: make_study(pairs), folds_of(pairs), RunConfig(), folder / rank, 1)
+    (folder / f"ran_{rank}").write_text(str(len(recorder.trained)))
 
 
 def test_two_ranks_share_the_folds_and_rank_0_ends_with_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,7 +216,8 @@ def test_two_ranks_share_the_folds_and_rank_0_ends_with_all(tmp_path: Path, monk
     unfinished = tmp_path / "0" / BY_PAIR / folds[BY_PAIR][1].name / "joint" / "pair_1.npz"  # of a rank 0 that was killed
     unfinished.parent.mkdir(parents=True)
     unfinished.write_bytes(b"half a file")
-    assert start_ranks(tmp_path) == [4, 3]
+    assert run_ranks(run_rank, tmp_path) == [0, 0]
+    assert [(tmp_path / f"ran_{rank}").read_text() for rank in "01"] == ["4", "3"]
     everything = {(protocol, fold.name) for protocol, of_protocol in folds.items() for fold in of_protocol}
     there = [{(path.parts[-3], path.parts[-2]) for path in (tmp_path / rank).rglob(SECONDS)} for rank in "01"]
     assert there[0] == everything

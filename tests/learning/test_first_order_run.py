@@ -40,7 +40,7 @@ def arguments(pairs: Path) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def run(arguments: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(arguments: list[str], tmp_path_factory: pytest.TempPathFactory, drawn_once: None) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "small"
     load_main()([*arguments, f"--output={folder}"])
     return folder

@@ -4,8 +4,6 @@ import json
 import logging
 import math
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 import pytest
 import small_run
 import torch
+from forked import begin, run_ranks
 from small_run import Watcher
 from torch import Tensor
 
@@ -25,16 +24,7 @@ from torchcrf_scan.learning.portions import Portion, as_portion
 from torchcrf_scan.learning.ranks import ALONE, Ranks
 from torchcrf_scan.model import JointScanCRF
 
-ROOT = Path(__file__).resolve().parents[2]
-PROGRAM = [sys.executable, str(Path(small_run.__file__))]
 KILLED = -9
-
-
-def start(*arguments: str, launcher: tuple[str, ...] = ()) -> int:
-    """Return code of the small run as a program of its own."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, *launcher, *PROGRAM[1:], *arguments]
-    return subprocess.run(command, env=environment, cwd=ROOT, check=False, capture_output=True, timeout=500).returncode
 
 
 def assert_identical(a: Any, b: Any, where: str = "") -> None:
@@ -81,7 +71,9 @@ def test_killed_and_resumed_ends_bit_for_bit_the_same(
     death: tuple[str, ...], workers: int, reached: int, straight: tuple[Learner, Watcher], tmp_path: Path
 ) -> None:
     """reached: step of the last checkpoint before the end. What a process of its own began, this one ends."""
-    assert start(str(tmp_path), *death) == KILLED
+    process = begin(small_run.main, [str(tmp_path), *death])
+    process.join()
+    assert process.exitcode == KILLED
     assert not (tmp_path / "curve.json").exists()
     learner, watcher = small_run.run(tmp_path, small_run.small_config(workers=workers), resume=True)
     assert_identical(final(learner), final(straight[0]))
@@ -90,8 +82,7 @@ def test_killed_and_resumed_ends_bit_for_bit_the_same(
 
 
 def test_two_processes_have_the_loss_curve_of_one(straight: tuple[Learner, Watcher], tmp_path: Path) -> None:
-    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
-    assert start(str(tmp_path), launcher=launcher) == 0
+    assert run_ranks(small_run.main, [str(tmp_path)]) == [0, 0]
     two, one = json.loads((tmp_path / "curve.json").read_text()), straight[1]
     assert two["loss"] == pytest.approx([report.terms["total"] for report in one.reports], rel=1e-5)
     assert [step for step, _ in two["validation"]] == [0, 2, 4, 6]

@@ -28,7 +28,7 @@ def read(folder: Path) -> EventAccumulator:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory: pytest.TempPathFactory, drawn_once: None) -> Path:
     """Four steps, with a look at the validation pairs every two."""
     folder = tmp_path_factory.mktemp("run")
     config = small_run.small_config(objective="unrolled", steps=4, batch_size=2, graph=True)

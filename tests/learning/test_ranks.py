@@ -1,19 +1,19 @@
 """One process among many: alone nothing is sent; of two, both have the same."""
 
 import os
-import socket
 from pathlib import Path
 
 import pytest
 import torch
-from torch import multiprocessing, nn
+from forked import run_ranks
+from torch import nn
 
 from torchcrf_scan.learning.ranks import ALONE, join
 
 
-def work(rank: int, port: int, folder: str) -> None:
+def work(folder: Path) -> None:
     """What every process of two does."""
-    os.environ |= {"RANK": str(rank), "WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    rank = int(os.environ["RANK"])
     with join("cpu") as ranks:
         assert (ranks.rank, ranks.world, ranks.is_first) == (rank, 2, rank == 0)
         layer = nn.Linear(2, 1)
@@ -25,14 +25,11 @@ def work(rank: int, port: int, folder: str) -> None:
             "shared": ranks.share(["first"] if ranks.is_first else ["second"]),
             "weight": layer.weight.detach(),
         }
-    torch.save(found, Path(folder) / f"{rank}.pt")
+    torch.save(found, folder / f"{rank}.pt")
 
 
 def test_two_processes_agree(tmp_path: Path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    multiprocessing.spawn(work, (port, str(tmp_path)), nprocs=2)
+    assert run_ranks(work, tmp_path) == [0, 0]
     for rank in range(2):
         found = torch.load(tmp_path / f"{rank}.pt", weights_only=True)
         assert found["sum"].tolist() == [2.0, 1.0]

@@ -31,7 +31,7 @@ def load_main() -> Callable[[list[str]], int]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory: pytest.TempPathFactory, drawn_once: None) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "small"
     load_main()([*SMALL, f"--output={folder}"])
     return folder

@@ -4,13 +4,12 @@ import json
 import logging
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
 import time
+from multiprocessing.connection import Connection as Connected
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +17,16 @@ import pytest
 pytest.importorskip("cyclonedds", reason="the library cyclonedds is not installed (extra `ros2`)")
 pytest.importorskip("rosbags", reason="the library rosbags is not installed (extra `ros2`)")
 
+import live_sender
+from cyclonedds.qos import Policy
+from cyclonedds.sub import DataReader
+from forked import CONTEXT, begin
+
 from torchcrf_scan.live.listener import OUTPUTS, Answered, Listener
-from torchcrf_scan.live.network import LOOPBACK, Connection, Network
+from torchcrf_scan.live.network import LOOPBACK, Connection, Network, _quality
 from torchcrf_scan.result import MovingObject, ScanResult
 from torchcrf_scan.scan import Floats, Scan
 
-TESTS = Path(__file__).resolve().parents[1]
 DOMAIN = 1 + os.getpid() % 200
 ALL = 1000  # scans may wait, so that a slow machine loses none
 
@@ -54,18 +57,11 @@ class Straight:
 def listen(stream: Any, domain: int, count: int, rate: float, *bad: int, **options: Any) -> tuple[list[Answered], dict[str, Any]]:
     """The scans that came, and what the other process was answered."""
     listener = Listener(Connection(Network(domain, (LOOPBACK,), LOOPBACK)), stream, **options)
-    with tempfile.TemporaryFile("w+") as told:  # a pipe would be full before the process ends
-        with robot(told, domain, count, rate, *bad) as process:
-            answered = list(listener.listen(lambda: process.poll() is not None))
-        told.seek(0)
-        return answered, json.load(told)
-
-
-def robot(told: IO[str], *arguments: object) -> subprocess.Popen[str]:
-    """The other process."""
-    path = os.pathsep.join([str(TESTS.parent), str(TESTS)])
-    command = [sys.executable, str(TESTS / "live_sender.py"), *map(str, arguments)]
-    return subprocess.Popen(command, stdout=told, text=True, env=os.environ | {"PYTHONPATH": path})
+    with tempfile.TemporaryDirectory() as folder:
+        process = begin(live_sender.drive, told := Path(folder) / "told.json", domain, count, rate, *bad)
+        answered = list(listener.listen(lambda: not process.is_alive()))
+        assert process.exitcode == 0
+        return answered, json.loads(told.read_text())
 
 
 @pytest.fixture(scope="module")
@@ -121,34 +117,33 @@ def test_odometry_is_the_first_guess() -> None:
     assert stream.stamps == pytest.approx(100 + np.arange(20) / 20)
 
 
-def test_a_subscriber_that_hangs_slows_nothing() -> None:
-    """A process that asked for every message, reliably, and then stops."""
-    domain = DOMAIN + 4
-    code = f"""
-import time
-from cyclonedds.qos import Policy
-from cyclonedds.sub import DataReader
-from torchcrf_scan.live.listener import OUTPUTS
-from torchcrf_scan.live.network import LOOPBACK, Connection, Network, _quality
-connection = Connection(Network({domain}, (LOOPBACK,), LOOPBACK))
-reliable = Policy.Reliability.Reliable(10**9)
-readers = [DataReader(connection.participant, connection._topic("/torchcrf_scan/" + name, kind), qos=_quality(kind, 100, reliable))
-           for name, kind in OUTPUTS.items()]
-while not all(reader.take(1) for reader in readers):
-    time.sleep(0.01)
-print("got all", flush=True)
-time.sleep(100)
-"""
-    stream, environment = Straight(), os.environ | {"PYTHONPATH": str(TESTS.parent)}
+def hang(domain: int, got_all: Connected) -> None:
+    """A process that asked for every message, reliably, and then does nothing more."""
+    connection = Connection(Network(domain, (LOOPBACK,), LOOPBACK))
+    reliable = Policy.Reliability.Reliable(10**9)
+    readers = [
+        DataReader(connection.participant, connection._topic(f"/torchcrf_scan/{name}", kind), qos=_quality(kind, 100, reliable))
+        for name, kind in OUTPUTS.items()
+    ]
+    while not all(reader.take(1) for reader in readers):
+        time.sleep(0.01)
+    got_all.send(os.getpid())
+    time.sleep(100)
+
+
+def test_a_subscriber_that_hangs_slows_nothing(tmp_path: Path) -> None:
+    domain, stream = DOMAIN + 4, Straight()
     listener = Listener(Connection(Network(domain, (LOOPBACK,), LOOPBACK)), stream, depth=ALL)
-    hanging = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment)
-    stopper = threading.Thread(target=lambda: hanging.stdout and hanging.stdout.readline() and hanging.send_signal(signal.SIGSTOP))
+    told, (got_all, says_so) = tmp_path / "told.json", CONTEXT.Pipe(duplex=False)
+    hanging = begin(hang, domain, says_so)
+    stopper = threading.Thread(target=lambda: os.kill(got_all.recv(), signal.SIGSTOP))
     stopper.start()
-    with tempfile.TemporaryFile("w+") as told, robot(told, domain, 100, 40.0) as process:
-        answered = list(listener.listen(lambda: process.poll() is not None))
+    try:
+        process = begin(live_sender.drive, told, domain, 100, 40.0)
+        answered = list(listener.listen(lambda: not process.is_alive()))
         assert not stopper.is_alive(), "it did not hang"
+        assert hanging.is_alive()
+    finally:
         hanging.kill()
-        hanging.communicate()
-        told.seek(0)
-        assert len(json.load(told)["scan_static"]) == 100
+    assert len(json.loads(told.read_text())["scan_static"]) == 100
     assert len(answered) == 100

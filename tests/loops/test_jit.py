@@ -35,7 +35,8 @@ def names_in_python(node: ast.AST) -> set[str]:
     for child in ast.iter_child_nodes(node):
         if decorators(child) & {"kernel", "entry"}:
             continue
-        own = {inner.name for inner in ast.walk(child) if isinstance(inner, ast.FunctionDef)}
+        inside = [] if isinstance(child, ast.expr) else ast.walk(child)  # an expression defines no function
+        own = {inner.name for inner in inside if isinstance(inner, ast.FunctionDef)}
         found |= names_in_python(child) - own
         if isinstance(child, ast.Name) and isinstance(child.ctx, ast.Load):
             found.add(child.id)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.data.worlds import NAMED_WORLDS, SimulatorConfig, every
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import FARTHEST, Start
 from torchcrf_scan.loops.pair import PairStart, pair_of
@@ -18,6 +18,8 @@ from torchcrf_scan.scan import Scan, ScanPair
 from torchcrf_scan.search.accept import score_of
 from torchcrf_scan.search.pairs import choose, initialise, start_arrays, start_pair, start_pairs, survey
 from torchcrf_scan.search.score import HypothesisScore
+from torchcrf_scan.search.survey import grids_of
+from torchcrf_scan.search.trusted import choose_background
 
 ROTATION, TRANSLATION = np.radians(1.0), 0.05
 OFFSET = np.array([-0.35, 2.8, 2.1])  # 3.5 m
@@ -42,6 +44,23 @@ def recovered(found: Tensor, truth: np.ndarray, translation: float = TRANSLATION
 
 def backgrounds(pairs: list[ScanPair]) -> np.ndarray:
     return np.array([pair.annotation.motions[0] for pair in pairs if pair.annotation is not None])
+
+
+def test_a_sensor_that_stands_is_seen_to_stand_while_somebody_passes() -> None:
+    passed = simulate_pairs(every(NAMED_WORLDS["passed_512"], 0.1), 24, 12, 4)
+    starts = start_of(ScanPairBatch.collate(passed))
+    assert recovered(starts.motions[:, 0], np.zeros((len(passed), 3))) == len(passed)
+
+
+def test_a_motion_that_explains_far_less_than_standing_still_is_not_believed() -> None:
+    angles = np.radians(np.linspace(-135, 135, 541))
+    ahead, beside = 4 / np.maximum(np.cos(angles), 1e-9), 3 / np.maximum(np.abs(np.sin(angles)), 1e-9)
+    scan = Scan.from_ranges(np.minimum(ahead, beside), angles)
+    source, target = grids_of(pair_of(ScanPairBatch.collate([ScanPair(scan, scan, 0.1)]), 0))
+    believed = choose_background(np.array([0.7, 2.0, -1.0]), np.array([0.0, 0.5, 0.0]), source, target)
+    assert not believed.is_found
+    assert np.abs(believed.motion).max() < 0.01
+    assert choose_background(np.array([0.001, 0.0, 0.0]), np.zeros(3), source, target).is_found
 
 
 def seen_from_afar(pair: ScanPair) -> ScanPair:

@@ -1,7 +1,9 @@
 """Frames show what is there, and movies hold them."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,6 +121,35 @@ def test_a_movie_that_fails_leaves_the_one_before(tmp_path: Path, name: str) -> 
     with pytest.raises(ValueError, match="stop"):
         fail()
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"before"]
+
+
+@pytest.mark.parametrize("length", [10, 0.5])
+def test_a_movie_that_ffmpeg_cuts_is_told(tmp_path: Path, length: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a full disk: ffmpeg ends with an error, which imageio-ffmpeg keeps to itself."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the library imageio-ffmpeg is not installed (extra `movie`)")
+    write_frames = ffmpeg.write_frames
+
+    def cut(path: str, *arguments: Any, **options: Any) -> Iterator[None]:
+        inner = write_frames(path, *arguments, **options)
+        inner.send(None)
+        try:
+            while True:
+                inner.send((yield))
+        finally:
+            inner.close()
+            whole = Path(path).read_bytes()
+            Path(path).write_bytes(whole[: int(length if length >= 1 else length * len(whole))])
+
+    monkeypatch.setattr(ffmpeg, "write_frames", cut)
+
+    def draw() -> None:
+        with writing_movie(tmp_path / "a.mp4", SIZE, 10.0) as write:
+            for frame in frames(5):
+                write(frame)
+
+    with pytest.raises(OSError, match=r"a\.mp4: expected ffmpeg to write"):
+        draw()
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_cannot_be_written_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

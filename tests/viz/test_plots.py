@@ -3,7 +3,6 @@
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -91,7 +90,7 @@ def test_errors_name_what_was_expected(tmp_path):
 def test_save_leaves_the_old_file_when_drawing_fails(tmp_path):
     class Broken(Figure):
         def savefig(self, name, **_):
-            Path(name).write_bytes(b"half")
+            name.write(b"half")
             raise RuntimeError("disk full")
 
     path = tmp_path / "figure.png"

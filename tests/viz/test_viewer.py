@@ -1,6 +1,7 @@
 """Results reach the viewer's file; a viewer that takes nothing holds nobody up."""
 
 import socket
+import sys
 import time
 from pathlib import Path
 
@@ -38,6 +39,6 @@ def test_a_viewer_that_takes_nothing_holds_nobody_up(monkeypatch: pytest.MonkeyP
 
 
 def test_a_missing_library_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ValueError, match=r"--visualize: expected the extra torchcrf-scan\[viewer\]"):
         viewer.check_viewer("--visualize")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,7 +11,7 @@ import torch
 
 from torchcrf_scan.commands.failures import attempt, one_line
 from torchcrf_scan.data.dataset import PairFiles
-from torchcrf_scan.data.formats import is_recording, read_recording
+from torchcrf_scan.data.formats import PAIR, find_format, read_recording
 from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.recording import Recording
@@ -74,14 +74,14 @@ def find_pairs(patterns: Sequence[str], every: int, failures: list[str], options
     paths = PairFiles(*patterns).paths
     if every < 1:
         raise ValueError(f"--every: expected at least 1, got {every}")
-    logs = {path for path in paths if attempt([], is_recording, path)}
-    if not logs and (every > 1 or options != AS_RECORDED):
+    pair_files = {path for path in paths if attempt([], find_format, path) is PAIR}
+    if len(pair_files) == len(paths) and (every > 1 or replace(options, on_bad=None) != AS_RECORDED):
         every_nth = f"--every: expected a log to take every {every}-th pair of"
         told = every_nth if every > 1 else "--topic, --odometry, --no_return: expected a log to read with them"
         raise ValueError(f"{told}, got pair files alone")
     found = []
     for path in paths:
-        if path not in logs:
+        if path in pair_files:
             found.append(PairPlace(path))
         elif (log := attempt(failures, read_recording, path, options)) is not None:
             found += [PairPlace(path, log, number) for number in range(0, len(log), every)]
@@ -91,7 +91,7 @@ def find_pairs(patterns: Sequence[str], every: int, failures: list[str], options
 
 def read_one(file: str, number: int | None, options: ReadOptions = AS_RECORDED) -> ScanPair:
     """The pair of a pair file (number None), or one of the pairs of a log."""
-    if not is_recording(file):
+    if find_format(file) is PAIR:
         if number is not None:
             raise ValueError(f"--number: expected none but with a log, got {number} with {file}")
         return read_pair(file)
@@ -110,6 +110,11 @@ def _each_once(places: Iterable[PairPlace]) -> list[PairPlace]:
     return list(found.values())
 
 
+def listed(values: tuple[str, ...] | str) -> tuple[str, ...]:
+    """The values of an option that takes a list, or one value without brackets."""
+    return (values,) if isinstance(values, str) else values
+
+
 def make_folder(option: str, folder: str | Path) -> Path:
     """Creates the folder if necessary; raises ValueError, with the name of its option, if that fails."""
     try:
@@ -122,8 +127,10 @@ def make_folder(option: str, folder: str | Path) -> Path:
 def check_output(output: str, log: str) -> None:
     """Raises ValueError for an output that is a folder, or would replace the log that it is made of."""
     path = Path(output)
-    if path.is_dir():
-        raise ValueError(f"--output: expected a file to write, got {output!r}, a folder")
+    if path.exists() and not path.is_file():
+        raise ValueError(
+            f"--output: expected a file to write, got {output!r}, {'a folder' if path.is_dir() else 'a device or pipe'}"
+        )
     check_other(output, log)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchcrf_scan.commands.arguments import make_folder
+from torchcrf_scan.commands.arguments import listed, make_folder
 from torchcrf_scan.pretrained import PRETRAINED
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ def bench(
     *,
     model: str = PRETRAINED,
     pairs: tuple[str, ...] | str = (),
-    backends: tuple[str, ...] = (),
+    backends: tuple[str, ...] | str = (),
     beams: tuple[int, ...] = (181, 361, 721, 1441, 2881),
     batches: tuple[int, ...] = (1, 8, 32),
     threads: tuple[int, ...] = (1, 2),
@@ -63,9 +63,8 @@ def bench(
             raise ValueError(f"--{name}: expected at least 1, got {value}")
     path = Path(output)
     make_folder("--output", path.parent)
-    patterns = (pairs,) if isinstance(pairs, str) else pairs
-    recorded = tuple(PairFiles(*patterns)) if patterns else ()
-    plan = Plan(model, choose_backends(backends), beams, batches, threads, repeats, simulated, patience, recorded, full)
+    recorded = tuple(PairFiles(*listed(pairs))) if pairs else ()
+    plan = Plan(model, choose_backends(listed(backends)), beams, batches, threads, repeats, simulated, patience, recorded, full)
     rates = measure_rates()
     rows = _compare(plan, Path(beside)) if beside else _measure(plan, rates, training_pairs)
     write_report(path, rows, rates)

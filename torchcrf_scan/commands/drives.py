@@ -6,7 +6,7 @@ import json as json_format
 import math
 from pathlib import Path
 
-from torchcrf_scan.commands.arguments import load_model
+from torchcrf_scan.commands.arguments import listed, load_model
 from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.whole_file import write_whole
 
@@ -28,7 +28,7 @@ HEADER = {
 
 def drives(
     *,
-    worlds: tuple[str, ...] = ("street", "crowd_768", "cars_360", "indoor_1081"),
+    worlds: tuple[str, ...] | str = ("street", "crowd_768", "cars_360", "indoor_1081"),
     scans: int = 100,
     count: int = 2,
     seed: int = 1,
@@ -41,7 +41,7 @@ def drives(
     (`pip install torchcrf-scan[tracking]`).
 
     Args:
-        worlds: names of simulated worlds
+        worlds: simulated world, or a list of them, [street,cars_360]
         scans: number of scans of each drive, at 10 Hz
         count: number of drives in each world
         seed: seed of the first drive; the others follow
@@ -51,16 +51,21 @@ def drives(
     from torchcrf_scan.benchmark.drives import score_drives
     from torchcrf_scan.data.worlds import NAMED_WORLDS
 
-    unknown = [name for name in worlds if name not in NAMED_WORLDS]
-    if unknown or not worlds:
+    names = listed(worlds)
+    unknown = [name for name in names if name not in NAMED_WORLDS]
+    if unknown or not names:
         raise ValueError(f"--worlds: expected some of {', '.join(NAMED_WORLDS)}, got {', '.join(unknown) or 'none'}")
     for name, value, least in (("scans", scans, 2), ("count", count, 1), ("seed", seed, 0)):
         if value < least:
             raise ValueError(f"--{name}: expected at least {least}, got {value}")
+    try:
+        import trackeval  # noqa: F401
+    except ImportError as error:
+        raise ValueError(f"expected the library trackeval, which scores tracks (extra `tracking`), got {error}") from error
     loaded = load_model(model)
     print("| world | " + " | ".join(HEADER.values()) + " |\n|" + "---|" * (len(HEADER) + 1))
     rows = {}
-    for name in worlds:
+    for name in names:
         rows[name] = score_drives(NAMED_WORLDS[name], scans, range(seed, seed + count), loaded)
         print(f"| {name} | " + " | ".join(_shown(key, rows[name][key]) for key in HEADER) + " |", flush=True)
     if json:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as json_format
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,10 @@ from torchcrf_scan.baselines.register import by_command
 from torchcrf_scan.baselines.start import match_start, match_static
 from torchcrf_scan.commands import frames
 from torchcrf_scan.commands.arguments import batches, find_files, load_model, make_folder
+from torchcrf_scan.commands.causes import check as check_causes
+from torchcrf_scan.commands.causes import explain
 from torchcrf_scan.commands.frames import FrameOffset, Turn, match_displaced
+from torchcrf_scan.commands.sequences import by_sequence, figures_of, rows_of, without_nan
 from torchcrf_scan.data.pair_file import read_pair, read_prediction
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
@@ -25,6 +27,7 @@ from torchcrf_scan.whole_file import write_whole
 
 if TYPE_CHECKING:
     from torchcrf_scan.evaluation.metrics import PairScore
+    from torchcrf_scan.evaluation.neighbours import NeighbourScore
     from torchcrf_scan.evaluation.report import Table
 
 Item = TypeVar("Item")
@@ -57,11 +60,14 @@ def evaluate(
     frame_offset: float | None = None,
     frame_turn: Turn | None = None,
     seed: int = 0,
+    causes: bool = False,
+    worst: int = 6,
+    output: str | None = None,
     candidates: int | None = None,
     device: str = "cpu",
     threads: int | None = None,
 ) -> int:
-    """Scores predictions of annotated pairs: an overview, the paper's Tables I to III, calibration; by sequence and in all.
+    """Scores predictions of annotated pairs: overview, the paper's Tables I to III, calibration, flow; by sequence and in all.
 
     The predictions are read from files, or made by a method. With `--frame_offset` or `--frame_turn` the method (joint or
     start) gets every second scan in another frame, without knowing the displacement; its results are scored in the pair's own
@@ -72,39 +78,56 @@ def evaluate(
         predictions: folder of prediction files named like the pair files, instead of a method
         method: joint (the model, default), start (its start and nearest points, no field), static (nothing moves), background
             (one registration, all of it background), icp (the paper's) or ransac (registration, then movers by RANSAC)
-        model: folder of a saved model, or the name of one that the package ships; simulated by default
+        model: folder of a saved model, or the name of one that the package ships; encoder by default
         json: file for all metrics with all digits
         frame_offset: metres by which the second scan's frame is displaced, exactly, in a random direction
         frame_turn: radians by which it is turned, exactly, to a random side; or any, uniform over the whole circle
         seed: seed of the random directions and sides
+        causes: also where wrong points come from (joint alone)
+        worst: with --causes, number of pairs with the most wrong points to name
+        output: with --causes, folder for its tables (causes.md) and pictures of the worst pairs
         candidates: target points considered for each source point, 0 for all; by default as the model was saved
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; by default its own choice
     """
-    from torchcrf_scan.evaluation.metrics import score_pair
-    from torchcrf_scan.evaluation.report import report
-
     if predictions is not None and (method, model) != (None, None):
         raise ValueError("--predictions: expected no --method and no --model beside it, got both")
     displacement = _displacement(frame_offset, frame_turn, predictions)
+    check_causes(output, worst, causes, method, (predictions, displacement))
     if json is not None:
         make_folder("--json", Path(json).parent)
     pairs = _annotated_pairs(pair_files)
+    load = partial(load_model, PRETRAINED if model is None else model, candidates, device, threads)
     if predictions is not None:
         name, answers = Path(predictions).resolve().name, _read_predictions(list(pairs), Path(predictions))
     else:
         name = "joint" if method is None else method
-        load = partial(load_model, PRETRAINED if model is None else model, candidates, device, threads)
         answers = _run(name, load, list(pairs.values()), displacement, seed)
-    scores = [score_pair(pair, answer) for pair, answer in zip(pairs.values(), answers, strict=True)]
-    tables, figures = report(_rows(name, scores)), _figures(name, scores)
-    if displacement is not None:
-        tables.append(_displaced_table(displacement, _rows(name, scores)))
-        figures |= _displaced_figures(displacement, seed, scores)
+    tables, figures = _score(name, list(pairs.values()), answers, displacement, seed)
+    if causes:
+        more, counts = explain(load(), list(pairs.values()), worst, output)
+        tables, figures = tables + more, figures | counts
     print("\n".join(table.to_markdown() for table in tables), end="")
     if json is not None:
         write_whole(Path(json), json_format.dumps(figures, indent=2) + "\n")
     return 0
+
+
+def _score(
+    name: str, pairs: Sequence[ScanPair], answers: Sequence[PairPrediction], displacement: FrameOffset | None, seed: int
+) -> tuple[list[Table], dict[str, Any]]:
+    """All tables and the entries of `--json`."""
+    from torchcrf_scan.evaluation.metrics import score_pair
+    from torchcrf_scan.evaluation.neighbours import NeighbourScore, neighbour_tables
+    from torchcrf_scan.evaluation.report import report
+
+    scores = [score_pair(pair, answer) for pair, answer in zip(pairs, answers, strict=True)]
+    beside = [NeighbourScore.of(pair, answer) for pair, answer in zip(pairs, answers, strict=True)]
+    tables, figures = [*report(rows_of(name, scores)), *neighbour_tables(rows_of(name, beside))], _figures(name, scores, beside)
+    if displacement is not None:
+        tables.append(_displaced_table(displacement, rows_of(name, scores)))
+        figures |= _displaced_figures(displacement, seed, scores)
+    return tables, figures
 
 
 def _displacement(metres: float | None, turn: Turn | None, predictions: str | None) -> FrameOffset | None:
@@ -164,7 +187,7 @@ def _displaced_table(displacement: FrameOffset, rows: dict[str, list[PairScore]]
 
 def _displaced_figures(displacement: FrameOffset, seed: int, scores: Sequence[PairScore]) -> dict[str, Any]:
     """Additional entries of `--json`: the displacement and the share of ego motions found."""
-    sequences = {sequence: _found_from_afar(part) for sequence, part in _by_sequence(scores).items()}
+    sequences = {sequence: _found_from_afar(part) for sequence, part in by_sequence(scores).items()}
     found = {"all": _found_from_afar(scores), "sequences": sequences}
     return {"displaced": {"metres": displacement.metres, "turn": displacement.turn, "seed": seed, "ego_success": found}}
 
@@ -175,22 +198,12 @@ def _found_from_afar(scores: Sequence[PairScore]) -> float:
     return 100 * sum(score.has_ego_within(FAR_TRANSLATION, FAR_ROTATION) for score in known) / max(len(known), 1)
 
 
-def _by_sequence(scores: Sequence[PairScore]) -> dict[str, list[PairScore]]:
-    sequences = sorted({score.sequence for score in scores})
-    return {sequence: [score for score in scores if score.sequence == sequence] for sequence in sequences}
-
-
-def _rows(name: str, scores: list[PairScore]) -> dict[str, list[PairScore]]:
-    """Row of a table -> its scores: every sequence, if there are several, then all."""
-    rows = {f"{name}, {sequence or 'no sequence'}": part for sequence, part in _by_sequence(scores).items()}
-    return {**(rows if len(rows) > 1 else {}), f"{name}, all": scores}
-
-
-def _figures(name: str, scores: list[PairScore]) -> dict[str, Any]:
-    """Entries of `--json`: `method`, `all` and `sequences`, every metric of `summarise`, null for missing values."""
+def _figures(name: str, scores: Sequence[PairScore], beside: Sequence[NeighbourScore]) -> dict[str, Any]:
+    """Entries of `--json`: `method`, `all` and `sequences`, all metrics of both summaries, `ranges`; null for missing values."""
+    from torchcrf_scan.evaluation.neighbours import errors_by_range, summarise_neighbours
     from torchcrf_scan.evaluation.summary import summarise
 
-    def figures(part: Sequence[PairScore]) -> dict[str, float | None]:
-        return {key: None if math.isnan(value) else value for key, value in summarise(part).items()}
-
-    return {"method": name, "all": figures(scores), "sequences": {k: figures(part) for k, part in _by_sequence(scores).items()}}
+    ours, theirs = figures_of(scores, summarise), figures_of(beside, summarise_neighbours)
+    sequences = {sequence: figures | theirs["sequences"][sequence] for sequence, figures in ours["sequences"].items()}
+    ranges = {name: without_nan(row) for name, row in errors_by_range(beside).items()}
+    return {"method": name, "all": ours["all"] | theirs["all"], "sequences": sequences, "ranges": ranges}

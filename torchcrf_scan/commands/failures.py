@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 Result = TypeVar("Result")
@@ -15,6 +16,23 @@ def attempt(failures: list[str], run: Callable[..., Result], *arguments: Any) ->
     except (ValueError, OSError) as error:
         failures.append(one_line(error))
         return None
+
+
+@dataclass
+class LeftOut:
+    """Malformed scans and messages of recordings that are left out. count: how many; first: why the first was."""
+
+    count: int = 0
+    first: str = ""
+
+    def add(self, error: ValueError) -> None:
+        """Counts one; to be called as `on_bad`."""
+        self.first = self.first or one_line(error)
+        self.count += 1
+
+    def __str__(self) -> str:
+        """The end of a line."""
+        return f"; {self.count} scans or messages left out, the first because of {self.first}" if self.count else ""
 
 
 def one_line(error: Exception) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from torchcrf_scan.commands.arguments import load_model
+from torchcrf_scan.commands.arguments import listed, load_model
 from torchcrf_scan.live.listener import Answered, Listener
 from torchcrf_scan.live.network import LOOPBACK, Connection, Network
 from torchcrf_scan.pretrained import PRETRAINED
@@ -29,7 +29,7 @@ def listen(
     world: str = "odom",
     waiting: int = 2,
     domain: int | None = None,
-    peers: tuple[str, ...] = (),
+    peers: tuple[str, ...] | str = (),
     interface: str = "",
     loopback: bool = False,
     report: float = 5.0,
@@ -56,7 +56,7 @@ def listen(
         world: frame of the published odometry and objects, that of the first scan
         waiting: scans that may wait for an answer; when more come, the oldest are left out
         domain: number of the DDS domain; by default the environment's ROS_DOMAIN_ID, or 0
-        peers: addresses to look for others at, without multicast
+        peers: address, or a list of them, to look for others at, without multicast
         interface: address of the network interface
         loopback: this machine alone, without multicast
         report: seconds between lines about rate and latency, 0 for none
@@ -68,7 +68,7 @@ def listen(
     """
     if waiting < 1:
         raise ValueError(f"--waiting: expected at least 1 scan, got {waiting}")
-    network = Network(domain, (LOOPBACK,), LOOPBACK) if loopback else Network(domain, peers, interface)
+    network = Network(domain, (LOOPBACK,), LOOPBACK) if loopback else Network(domain, listed(peers), interface)
     answering = ScanStream(load_model(model, None, device, threads), stream)
     names = {"topic": topic, "prefix": prefix, "world": world}
     listener = Listener(Connection(network), answering, odometry=odometry, no_return=no_return, depth=waiting, **names)

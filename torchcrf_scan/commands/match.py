@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from torchcrf_scan.commands.arguments import batches, find_pairs, load_model, make_folder
-from torchcrf_scan.commands.failures import attempt, one_line
+from torchcrf_scan.commands.failures import LeftOut, attempt, one_line
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
 from torchcrf_scan.geometry import se2
@@ -37,8 +37,8 @@ def match(
     """Matches scan pairs: writes OUTPUT/<name of the pair>.npz for each and prints the motions of the sensor and the movers.
 
     A pair is a file, or two consecutive scans of a log; those of run.log are named run_00000, run_00001 and so on. The format of
-    a log (CARMEN, bags of ROS 1 and 2, MCAP, CSV) is recognised. Earlier predictions are replaced, other files never. Files that
-    cannot be read or written are skipped and reported at the end.
+    a log (CARMEN, bags of ROS 1 and 2, MCAP, CSV) is recognised; a malformed scan in it is left out and counted. Earlier
+    predictions are replaced, other files never. Files that cannot be read or written are skipped and reported at the end.
 
     Args:
         files: pair files and logs
@@ -53,7 +53,8 @@ def match(
         threads: number of threads that torch computes with; by default its own choice
     """
     failures: list[str] = []
-    places = find_pairs(files, every, failures, ReadOptions(topic, odometry, no_return))
+    left_out = LeftOut()
+    places = find_pairs(files, every, failures, ReadOptions(topic, odometry, no_return, left_out.add))
     targets = {place.name: _prediction_path(place.name, Path(output)) for place in places}
     network = load_model(model, candidates, device, threads)
     make_folder("--output", output)
@@ -67,7 +68,7 @@ def match(
                     bar.write(describe(pair, prediction))
                     moving.append((int((prediction.cluster > BACKGROUND).sum()), len(pair.source)))
             bar.update(len(part))
-    print(f"{len(moving)} of {len(places)} pairs matched{_shares(moving)}; predictions in {output}")
+    print(f"{len(moving)} of {len(places)} pairs matched{_shares(moving)}; predictions in {output}{left_out}")
     for failure in failures:
         print(f"torchcrf-scan match: error: {failure}", file=sys.stderr)
     return 1 if failures else 0

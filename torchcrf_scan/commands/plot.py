@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from torchcrf_scan.commands.arguments import load_model, read_one
+from torchcrf_scan.commands.failures import LeftOut
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import read_prediction
 
@@ -34,10 +35,11 @@ def plot(
         raise ValueError("--prediction: expected no --model beside it, got both")
     if Path(output).suffix.lower() != ".png":
         raise ValueError(f"--output: expected a name ending in .png, got {output}")
-    pair = read_one(file, number, ReadOptions(topic))
+    left_out = LeftOut()
+    pair = read_one(file, number, ReadOptions(topic, on_bad=left_out.add))
     answer = read_prediction(prediction) if prediction is not None else None
     if model is not None:
         answer = load_model(model).match_pairs([pair])[0]
     save_figure(plot_pair(pair, answer), output)
-    print(f"{pair.name} drawn in {output}")
+    print(f"{pair.name} drawn in {output}{left_out}")
     return 0

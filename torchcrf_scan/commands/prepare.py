@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from tqdm import tqdm
 
+from torchcrf_scan.commands.arguments import listed
 from torchcrf_scan.loops import machine
 
 LEVELS = ("x86-64-v2", "x86-64-v3", "generic")
 
 
-def prepare(*, levels: tuple[str, ...] = ()) -> int:
+def prepare(*, levels: tuple[str, ...] | str = ()) -> int:
     """Builds the machine code that is missing, in about a minute; needs a C compiler.
 
     Without it the first answers take seconds each, while the same is built in the background. To make a wheel that carries it:
@@ -21,7 +22,7 @@ def prepare(*, levels: tuple[str, ...] = ()) -> int:
     """
     from torchcrf_scan.prepare.build import build_missing
 
-    for level in levels:
+    for level in listed(levels):
         if level not in LEVELS:
             raise ValueError(f"--levels: expected some of {', '.join(LEVELS)}, got {level}")
     with tqdm(unit="part", disable=None) as bar:
@@ -30,6 +31,6 @@ def prepare(*, levels: tuple[str, ...] = ()) -> int:
             bar.total = count
             bar.update(done - bar.n)
 
-        folder = build_missing(levels or [machine.processor_level()], progress)
+        folder = build_missing(listed(levels) or [machine.processor_level()], progress)
     print(f"machine code is ready in {folder}")
     return 0

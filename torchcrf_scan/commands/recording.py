@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from torchcrf_scan.commands.arguments import load_model
-from torchcrf_scan.commands.failures import one_line
+from torchcrf_scan.commands.failures import LeftOut, one_line
 from torchcrf_scan.commands.outputs import Add, Output, Outputs, viewers
 from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
 from torchcrf_scan.data.formats import read_scans
@@ -106,26 +106,19 @@ class Report:
     """What became of a recording.
 
     Attributes:
-        tally: counts of its results. bad: number of scans and messages left out; first_bad: why the first was.
+        tally: counts of its results. left_out: scans and messages that are none.
         failures: what went wrong, one line each. rate: scans a second, until all is written. is_interrupted: Ctrl-C ended it.
     """
 
     tally: Tally = field(default_factory=Tally)
-    bad: int = 0
-    first_bad: str = ""
+    left_out: LeftOut = field(default_factory=LeftOut)
     failures: list[str] = field(default_factory=list)
     rate: float = 0.0
     is_interrupted: bool = False
 
-    def leave_out(self, error: ValueError) -> None:
-        """Counts a bad scan or message."""
-        self.first_bad = self.first_bad or one_line(error)
-        self.bad += 1
-
     def describe(self) -> str:
         """One line."""
-        bad = f"; {self.bad} scans or messages left out, the first because of {self.first_bad}" if self.bad else ""
-        return f"{self.tally.describe()}; {self.rate:.1f} scans/s{bad}"
+        return f"{self.tally.describe()}; {self.rate:.1f} scans/s{self.left_out}"
 
 
 def chosen(readings: Iterable[Reading], options: Options) -> Iterator[Reading]:
@@ -172,12 +165,12 @@ def process(
     """
     report, told = Report(), options.reading
     topic, odometry, no_return = told.topic, told.odometry, told.no_return
-    scans = read_scans(log, topic, odometry=odometry, no_return=no_return, on_bad=report.leave_out)
+    scans = read_scans(log, topic, odometry=odometry, no_return=no_return, on_bad=report.left_out.add)
     readings = until_fault(chosen(scans, options), report.failures)
     ahead = list(islice(readings, LOOK_AHEAD))
     if not ahead:
         nothing = f"{log}: expected scans in the chosen time, got none"
-        raise ValueError(next(iter(report.failures), report.first_bad or nothing))
+        raise ValueError(next(iter(report.failures), report.left_out.first or nothing))
     if options.has_odometry and all(reading.odometry is None for reading in ahead):
         raise ValueError(f"--use_odometry: expected a recording with odometry, got none in {log}")
     begin = perf_counter()
@@ -200,7 +193,7 @@ def _feed(stream: Stream, reading: Reading, options: Options, add: Add, report: 
     try:
         result = stream.feed(reading.scan, reading.stamp, reading.odometry if options.has_odometry else None)
     except ValueError as error:
-        report.leave_out(error)
+        report.left_out.add(error)
         return
     report.tally.add(result)
     add(result)

@@ -38,12 +38,13 @@ def type_name(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message. stamp: seconds, when it was recorded. where: file and place, for errors."""
+    """A message. stamp: seconds, when it was recorded. where: file and place, for errors. is_packed: by zstd."""
 
     topic: Topic
     stamp: float
     data: bytes
     where: str
+    is_packed: bool = False
 
 
 class Bag(Protocol):
@@ -90,8 +91,10 @@ def _decompress(decompressor: Any, data: bytes, most: int) -> bytes:
 
 
 def _lz4() -> Any:
-    from lz4.frame import LZ4FrameDecompressor
-
+    try:
+        from lz4.frame import LZ4FrameDecompressor
+    except ImportError as error:
+        raise ValueError(f"expected the library lz4, which unpacks this (extra `ros`), got {error}") from error
     return LZ4FrameDecompressor()
 
 
@@ -99,5 +102,8 @@ def _zstd() -> Any:
     try:
         from compression import zstd
     except ImportError:
-        from backports import zstd
+        try:
+            from backports import zstd
+        except ImportError as error:
+            raise ValueError(f"expected the library backports.zstd, which unpacks this (extra `ros`), got {error}") from error
     return zstd.ZstdDecompressor()

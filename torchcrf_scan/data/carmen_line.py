@@ -73,9 +73,9 @@ def _read_fields(fields: list[str], family: str, line: Line) -> LaserLine:
         raise ValueError(f"{line.where}: expected {poses + STAMPS} fields behind the ranges, got {len(tail)}")
     numbers = np.array(tail[: min(poses, 6)], dtype=np.float64)
     stamps = np.array([tail[poses], tail[-1]], dtype=np.float64)
-    if not np.isfinite(stamps).all() or not np.isfinite(numbers).all():
-        raise ValueError(f"{line.where}: expected finite poses and stamps, got {' '.join(tail)[:60]!r}")
-    first, second = (numbers[[k + 2, k, k + 1]] if poses else None for k in (0, 3))
+    if not np.isfinite(stamps).all():
+        raise ValueError(f"{line.where}: expected finite stamps, got {' '.join(tail)[:60]!r}")
+    first, second = (numbers[[k + 2, k, k + 1]] if poses and np.isfinite(numbers[k : k + 3]).all() else None for k in (0, 3))
     return LaserLine(ranges, start, step, limit, stamps, first, second)
 
 

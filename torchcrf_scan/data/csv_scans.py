@@ -5,7 +5,8 @@
     0.050,2.30,2.32, ... ,
 
 The first row names the columns: `stamp` (seconds), perhaps the sensor's pose by the wheels, `odom_theta` (radians), `odom_x` and
-`odom_y` (metres), then the bearing of every beam in radians. An empty field, nan or inf is a beam without return.
+`odom_y` (metres), then the bearing of every beam in radians. An empty field, nan or inf is a beam without return, or an unknown
+pose.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ def _read_row(line: Line, has_odometry: bool, bearings: Floats, no_return: float
         values = np.array(fields, dtype=np.float64)
     except ValueError as error:
         raise ValueError(f"{line.where}: expected numbers, got {error}") from error
-    if not np.isfinite(values[:ahead]).all():
-        raise ValueError(f"{line.where}: expected a finite stamp and pose, got {line.text[:60]!r}")
+    if not np.isfinite(values[0]):
+        raise ValueError(f"{line.where}: expected a finite stamp, got {line.text[:60]!r}")
     ranges = np.where(values[ahead:] >= no_return, np.nan, values[ahead:])
-    return Reading(Scan.from_ranges(ranges, bearings), float(values[0]), values[1:4] if has_odometry else None)
+    is_known = has_odometry and np.isfinite(values[1:4]).all()
+    return Reading(Scan.from_ranges(ranges, bearings), float(values[0]), values[1:4] if is_known else None)

@@ -11,8 +11,6 @@ Writing is atomic and checked by the reader's own rules; the same content gives 
 
 from __future__ import annotations
 
-import os
-import secrets
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +24,7 @@ from torchcrf_scan.data.limits import MOST_BEAMS
 from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.scan import OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, Scan, ScanPair, check_sensor
+from torchcrf_scan.whole_file import whole_file
 
 _KINDS: dict[str, tuple[str, type]] = {
     "float": ("fiu", np.float64),
@@ -132,7 +131,7 @@ def write_pair(path: str | Path, pair: ScanPair) -> None:
 def read_pair_scans(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iterator[Reading]:
     """Both scans of a pair file as a recording that begins at 0 s; raises the errors of `read_pair`.
 
-    options: ignored, as a pair file says everything.
+    options: without meaning, as a pair file says everything.
     """
     pair = read_pair(path)
     yield Reading(pair.source, 0.0)
@@ -273,14 +272,7 @@ def _annotation_arrays(annotation: Annotation, is_return: Bools) -> dict[str, ND
 
 
 def _save(fields: _Fields) -> None:
-    """Writes the archive atomically: to a temporary file in the same folder, then renamed."""
-    path = fields.path
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    """Writes the archive atomically."""
     arrays: dict[str, Any] = fields.arrays
-    try:
-        with open(temporary, "xb") as file:
-            np.savez(file, **arrays)
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with whole_file(fields.path) as file:
+        np.savez(file, **arrays)

@@ -17,6 +17,8 @@ from torchcrf_scan.scan import Floats, ScanPair
 
 logger = logging.getLogger(__name__)
 
+Read = Callable[[], Iterator[Reading]]
+
 SUFFIXES = (".gz", ".log", ".bag", ".mcap", ".db3", ".csv")
 
 
@@ -28,7 +30,7 @@ class Recording(Sequence[ScanPair]):
 
     Args:
         path: file or folder, for names.
-        read: begins to read.
+        read: begins to read. again: begins to read once more, without a word on what is left out; None: as `read` does.
 
     Attributes:
         fault: what ended the reading before the end of the file; None: nothing.
@@ -37,22 +39,22 @@ class Recording(Sequence[ScanPair]):
         ValueError: fewer than two scans.
     """
 
-    def __init__(self, path: str | Path, read: Callable[[], Iterator[Reading]]) -> None:
-        self.path, self._read = Path(path), read
+    def __init__(self, path: str | Path, read: Read, again: Read | None = None) -> None:
+        self.path, self._again = Path(path), again or read
         self.fault: ValueError | None = None
-        stamps, odometry = self._survey()
+        stamps, odometry = self._survey(read())
         self._steps = steps_with_a_word(stamps, str(self.path))
         self._motions = motions_between(odometry)
         self._position = -1
         self._ahead: Iterator[Reading] = iter(())
         self._scans: tuple[Reading, ...] = ()
 
-    def _survey(self) -> tuple[Floats, list[Floats | None]]:
+    def _survey(self, readings: Iterator[Reading]) -> tuple[Floats, list[Floats | None]]:
         """(S,) stamps and S odometry poses."""
         stamps: list[float] = []
         odometry: list[Floats | None] = []
         try:
-            for reading in self._read():
+            for reading in readings:
                 stamps.append(reading.stamp)
                 odometry.append(reading.odometry)
         except ValueError as error:
@@ -84,7 +86,7 @@ class Recording(Sequence[ScanPair]):
     def _scans_at(self, k: int) -> tuple[Reading, ...]:
         """The scans k and k + 1."""
         if self._position > k or self._position < 0:
-            self._position, self._ahead = 0, self._read()
+            self._position, self._ahead = 0, self._again()
             self._scans = (next(self._ahead), next(self._ahead))
         while self._position < k:
             self._scans = (self._scans[1], next(self._ahead))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from torchcrf_scan.data.bag_records import Bag, Message, Topic, unpack_message
+from torchcrf_scan.data.bag_records import Bag, Message, Topic
 from torchcrf_scan.data.mcap_bag import MAGIC, McapBag
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class FolderBag:
         """The messages of some topics as recorded; raises ValueError at a fault, as its files do."""
         for part in self._parts:
             for message in part.messages(names):
-                yield _unpacked(message) if self._is_packed else message
+                yield replace(message, is_packed=self._is_packed)
 
 
 def is_folder_bag(path: Path) -> bool:
@@ -122,10 +122,3 @@ def _part(path: Path) -> Bag:
     if head == SQLITE:
         return SqliteBag(path)
     raise ValueError(f"{path}: expected a database of SQLite or MCAP, got another format")
-
-
-def _unpacked(message: Message) -> Message:
-    try:
-        return replace(message, data=unpack_message(message.data))
-    except ValueError as error:
-        raise ValueError(f"{message.where}: {error}") from error

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchcrf_scan.data.bag_records import Bag, Message, Topic
+from torchcrf_scan.data.bag_records import Bag, Message, Topic, unpack_message
 from torchcrf_scan.data.mcap_bag import McapBag
 from torchcrf_scan.data.options import AS_RECORDED, AUTO, ReadOptions
 from torchcrf_scan.data.reading import Reading
@@ -78,17 +78,13 @@ def _choose_odometry(path: Path, topics: list[Topic], name: str | None) -> Topic
 
 def _choose(path: Path, topics: list[Topic], types: tuple[str, ...], name: str | None, option: str) -> Topic:
     fits = [topic for topic in topics if topic.type in types]
-    if name is not None:
-        chosen = [topic for topic in fits if topic.name.strip("/") == name.strip("/")]
-        if chosen:
-            return chosen[0]
-        raise ValueError(f"{path}: {option}: expected one of {_listed(fits)}, got {name}")
-    if len(fits) == 1:
-        return fits[0]
-    if fits:
-        raise ValueError(f"{path}: {option}: expected which of {_listed(fits)}, got none")
-    wanted = " or ".join(kind.replace("/msg/", "/") for kind in types)
-    raise ValueError(f"{path}: {option}: expected a topic of type {wanted}, got {_listed(topics) or 'none'}")
+    if not fits:
+        wanted = " or ".join(kind.replace("/msg/", "/") for kind in types)
+        raise ValueError(f"{path}: {option}: expected a topic of type {wanted}, got {_listed(topics) or 'none'}")
+    chosen = [topic for topic in fits if name is None or topic.name.strip("/") == name.strip("/")]
+    if len(chosen) == 1:
+        return chosen[0]
+    raise ValueError(f"{path}: {option}: expected {'one' if name else 'which'} of {_listed(fits)}, got {name or 'none'}")
 
 
 def _listed(topics: list[Topic]) -> str:
@@ -105,9 +101,9 @@ class _Reader:
     def decode(self, message: Message) -> Any:
         """The message as an object; raises ValueError with its place."""
         try:
-            if message.topic.is_cdr:
-                return self._store.deserialize_cdr(message.data, message.topic.type)
-            return self._store.deserialize_ros1(message.data, message.topic.type)
+            data = unpack_message(message.data) if message.is_packed else message.data
+            deserialize = self._store.deserialize_cdr if message.topic.is_cdr else self._store.deserialize_ros1
+            return deserialize(data, message.topic.type)
         except Exception as error:  # a library's, of damaged bytes
             raise ValueError(f"{message.where}: expected a {message.topic.type}, got {type(error).__name__}: {error}") from error
 

@@ -26,7 +26,7 @@ INDOOR_SPEED = 1.5  # m/s, the fastest robot
 SENSOR_CLEARANCE = 0.3  # metres between movers and the sensor
 SWEEP_PARTS = 24  # groups of beams that are cast at the same time, while a sensor sweeps
 LEAST_SEEN = 3  # minimum number of returns of a mover when it enters
-ENTRY_TRIES = {"any": 12, "truck": 80, "slider": 40}
+ENTRY_TRIES = {"any": 12, "truck": 80, "slider": 40, "passer": 40}
 TRUCK_SHARE = (0.4, 0.5)  # of the returns
 
 
@@ -196,6 +196,7 @@ def simulate_sequence(config: SimulatorConfig, pairs: int, rng: np.random.Genera
     """The pairs + 1 scans of one drive. patience: scans for which a mover that is out of sight stays in the world."""
     n_movers = int(rng.integers(config.movers_min, config.movers_max, endpoint=True))
     special = [kind for kind, p in (("truck", config.dominant_mover), ("slider", config.aperture)) if rng.random() < p]
+    special += ["passer"] if config.passer > 0 and rng.random() < config.passer else []
     kinds = (special + ["any"] * max(n_movers - len(special), 0))[: config.movers_max]
     beyond = min(config.range_max / config.scale, FARTHEST_WORLD[config.scene]) * rng.uniform(0.4, 1.0)
     build = street if config.scene == "street" else indoor

@@ -343,6 +343,17 @@ def _cyclist(rng: np.random.Generator, world: World, viewer: Viewer, number: int
 def _walker(rng: np.random.Generator, world: World, viewer: Viewer, number: int, time: float) -> Mover:
     near, far = (4.0, 18.0) if world.is_street else (1.5, 8.0)
     pose = np.array([rng.uniform(-np.pi, np.pi), _ahead(rng, viewer, near, far), rng.uniform(-1, 1) * world.footway])
+    return _walking(rng, number, time, pose)
+
+
+def _passer(rng: np.random.Generator, viewer: Viewer, number: int, time: float) -> Mover:
+    """Somebody who walks across the view, so near that the legs hide much of it."""
+    bearing, away = rng.uniform(-np.pi / 3, np.pi / 3), rng.uniform(0.55, 1.0)
+    across = bearing + rng.choice([-0.5, 0.5]) * np.pi + rng.normal(0, 0.2)
+    return _walking(rng, number, time, se2.compose(viewer.pose, np.array([across, away * np.cos(bearing), away * np.sin(bearing)])))
+
+
+def _walking(rng: np.random.Generator, number: int, time: float, pose: Floats) -> Mover:
     apart, radius = rng.uniform(0.09, 0.13), rng.uniform(0.06, 0.09)
     legs = Shapes.of((), [disc(0, apart, radius), disc(0, -apart, radius)])
     return Mover(number, time, pose, legs, rng.uniform(0.6, 1.8), rng.normal(0, 0.1), stride=rng.uniform(0.03, 0.14))
@@ -370,7 +381,9 @@ def _beside(rng: np.random.Generator, world: World, viewer: Viewer, number: int,
 
 
 def draw_mover(rng: np.random.Generator, world: World, viewer: Viewer, number: int, time: float, kind: str = "any") -> Mover:
-    """A mover near the viewer: `truck`, `slider`, or `any` that is usual in the world."""
+    """A mover near the viewer: `truck`, `slider`, `passer`, or `any` that is usual in the world."""
+    if kind == "passer":
+        return _passer(rng, viewer, number, time)
     if kind != "any":
         return _beside(rng, world, viewer, number, time, kind)
     if world.is_street:

@@ -31,6 +31,7 @@ class SimulatorConfig:
         clutter: amount of hedges, bushes and low crowns, whose returns are not repeatable; 2 is an ordinary street.
         dominant_mover: probability that a truck drives beside the sensor and fills 40 to 50 % of the returns of a sequence.
         aperture: probability that a car is seen along one side only and slides along it.
+        passer: probability that somebody passes half a metre to a metre before the sensor.
         scale: factor on the whole world and on every motion, but not on the sensor; 0.1 imitates 1:10 model cars.
         sweep: seconds from the first to the last beam of a scan, while the sensor and the movers move on; 0: all at once.
         litter: loose things (boxes, chairs, plants, people who stand) on each ten metres beside the sensor's way.
@@ -58,6 +59,7 @@ class SimulatorConfig:
     clutter: Amount = 2.0
     dominant_mover: Share = 0.0
     aperture: Share = 0.0
+    passer: Share = 0.0
     scale: Positive = 1.0
     sweep: Amount = 0.0
     litter: Amount = 0.0
@@ -91,6 +93,7 @@ WORLDS = {
 AS_RECORDED = SimulatorConfig(range_noise=0.008, states_limits=False, matches_mixed=True, least_travel=1.0, movers_max=3)
 STREET = replace(AS_RECORDED, ego_translation=3.0, vibration=0.03, litter=0.5)
 INDOOR = replace(AS_RECORDED, scene="indoor", range_max=30.0, dt=0.3, ego_translation=0.4, litter=2.0, vibration=0.015)
+STANDING = replace(INDOOR, ego_translation=0.0, ego_rotation=0.0)
 SMALL = replace(AS_RECORDED, scale=0.1, range_max=9.0, dropout=0.3, dt=0.4, ego_translation=4.0, ego_rotation=0.25, aperture=0.2)
 CARS = replace(SMALL, beams=360, fov=360.0, range_noise=0.005, vibration=0.012, sweep=0.08)
 
@@ -114,6 +117,7 @@ TRAINING_WORLDS = {  # named by scene and beams
     "indoor_512": replace(INDOOR, beams=512, fov=240.0, range_max=10.0, vibration=0.005, sweep=0.07, movers_max=5),
     "indoor_1081": replace(INDOOR, beams=1081, fov=270.0, vibration=0.005, sweep=0.019, movers_max=5),
     "crowd_768": replace(INDOOR, beams=768, fov=270.0, movers_min=2, movers_max=6, vibration=0.005, ego_translation=0.1),
+    "passed_512": replace(STANDING, beams=512, fov=240.0, range_max=8.0, dropout=0.5, passer=1.0),
     "cars_360": CARS,
     "cars_240": replace(CARS, beams=240, fov=240.0, range_noise=0.01, sweep=0.1),
     "still_street_361": without_movers(replace(STREET, sweep=0.05)),

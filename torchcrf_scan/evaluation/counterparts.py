@@ -1,11 +1,12 @@
-"""Comparison of two labellings: movers matched by overlap, associations by the beams between them."""
+"""Comparison of two labellings: movers matched by overlap, associations by the beams between them, outliers by their place."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 
-from torchcrf_scan.scan import BACKGROUND, Floats, Ints, Scan
+from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints, PairPrediction, Scan, ScanPair
 
 
 def match_movers(cluster: Ints, predicted: Ints) -> dict[int, int]:
@@ -46,6 +47,17 @@ def movers_in_order(labels: Ints) -> Ints:
     ids, first = np.unique(labels, return_index=True)
     ids = ids[np.argsort(first)]
     return ids[ids > BACKGROUND]
+
+
+def clusters_beneath(pair: ScanPair, prediction: PairPrediction) -> Ints:
+    """(N,) cluster of every source point, that of the nearest answered inlier for answered outliers; background without any."""
+    beam, points = pair.source.beam, pair.source.points
+    cluster = prediction.cluster[beam]
+    is_inlier = (cluster != OUTLIER) & (prediction.association[beam] >= 0)
+    if not is_inlier.any():
+        return np.maximum(cluster, BACKGROUND)
+    nearest = cKDTree(points[is_inlier]).query(points)[1]
+    return np.where(cluster == OUTLIER, cluster[is_inlier][nearest], cluster)
 
 
 def beams_apart(target: Scan, association: Ints, other: Ints) -> Floats:

@@ -10,10 +10,8 @@ import json
 import os
 import pickle
 import re
-import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import lru_cache
@@ -30,6 +28,7 @@ from torchcrf_scan.experiment.models import fit_models
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.whole_file import whole_path
 
 SECONDS = "seconds.json"
 LONGEST = 100  # bytes of a file name; longer ones are truncated and end in a digest
@@ -131,24 +130,15 @@ def load_study(place: Path) -> tuple[Study, RunConfig]:
 def write_fold(folder: Path, answers: Mapping[str, Mapping[str, Answer]]) -> None:
     """answers: pair name -> method -> answer."""
     seconds = {pair: {method: one.seconds for method, one in by_method.items()} for pair, by_method in answers.items()}
-    with appearing(folder) as temporary:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with whole_path(folder) as temporary:
+        temporary.mkdir()
         for pair, by_method in answers.items():
             for method, one in by_method.items():
                 path = temporary / file_name(method) / f"{file_name(pair)}.npz"
                 path.parent.mkdir(exist_ok=True)
                 write_prediction(path, one.prediction)
         (temporary / SECONDS).write_text(json.dumps(seconds, indent=1) + "\n")
-
-
-@contextmanager
-def appearing(folder: Path) -> Iterator[Path]:
-    """A temporary folder to fill, which is renamed to `folder` at the end."""
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    yield temporary
-    shutil.rmtree(folder, ignore_errors=True)
-    os.replace(temporary, folder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +184,9 @@ def gather(folder: Path, mine: Sequence[Path]) -> None:
         dist.gather_object(files, boxes)
         for fold, content in ((fold, content) for box in boxes or [] for fold, content in box.items()):
             if not (folder / fold / SECONDS).is_file():
-                with appearing(folder / fold) as temporary:
+                folder.mkdir(parents=True, exist_ok=True)
+                with whole_path(folder / fold) as temporary:
+                    temporary.mkdir()
                     for name, data in content.items():
                         (temporary / name).parent.mkdir(exist_ok=True)
                         (temporary / name).write_bytes(data)

@@ -38,10 +38,22 @@ def initialise(batch: ScanPairBatch, score: Score, clusters: int) -> Start:
     return start_tensors(start_pairs([pair_of(batch, b) for b in range(len(batch))], score, clusters), batch)
 
 
-def start_pairs(pairs: Sequence[Pair], score: Score, clusters: int, expected: Expected | None = None) -> list[PairStart]:
-    """The same for pairs as arrays, each by itself. expected: of a single pair, movers known from before."""
+def start_pairs(
+    pairs: Sequence[Pair],
+    score: Score,
+    clusters: int,
+    expected: Expected | None = None,
+    record: list[Survey | None] | None = None,
+) -> list[PairStart]:
+    """The same for pairs as arrays, each by itself.
+
+    expected: of a single pair, movers known from before. record: gets every pair's survey, in order, as `survey_pair` gives it.
+    """
     assert expected is None or len(pairs) == 1
-    return of_pairs(lambda pair, share: start_pair(pair, score, clusters, share, expected), pairs)
+    if record is None:
+        return of_pairs(lambda pair, share: start_pair(pair, score, clusters, share, expected), pairs)
+    record += of_pairs(lambda pair, share: survey_pair(pair, share, expected), pairs)
+    return [start_from(pair, seen, score, clusters) for pair, seen in zip(pairs, record[-len(pairs) :], strict=True)]
 
 
 def survey(batch: ScanPairBatch) -> list[Survey | None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.viz.lettering import drawable
 from torchcrf_scan.viz.marks import INK, NOTE, WRONG
 from torchcrf_scan.viz.scene import Scene, Window
 
@@ -67,7 +68,7 @@ def finish(figure: Figure, pair: ScanPair) -> Figure:
     """Adds the pair's name and one legend for all panels."""
     name = pair.name or pair.sequence or "scan pair"
     counts = f"{len(pair.source)} and {len(pair.target)} returns, {pair.dt:.3g} s apart; x ahead, y left, metres"
-    figure.suptitle(f"{name}: {counts}", x=0.008, ha="left", fontsize=11.5, color=INK, parse_math=False)
+    figure.suptitle(f"{drawable(name)}: {counts}", x=0.008, ha="left", fontsize=11.5, color=INK, parse_math=False)
     entries: dict[str, Artist] = {}
     for ax in figure.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):

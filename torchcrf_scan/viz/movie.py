@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,7 +29,11 @@ Write = Callable[[Image], None]
 
 def can_write_mp4() -> bool:
     """Whether the extra `movie` is installed."""
-    return importlib.util.find_spec("imageio_ffmpeg") is not None
+    try:
+        import imageio_ffmpeg  # noqa: F401
+    except ImportError:
+        return False
+    return True
 
 
 def check_movie(option: str, path: str | Path) -> Path:
@@ -68,7 +71,7 @@ def writing_movie(path: Path, size: tuple[int, int], rate: float) -> Iterator[Wr
 @contextmanager
 def _writing_mp4(path: Path, size: tuple[int, int], rate: float) -> Iterator[Write]:
     """Pipes frames to ffmpeg, which is not in our process group: Ctrl-C stops us, and we end the movie."""
-    from imageio_ffmpeg import write_frames
+    from imageio_ffmpeg import count_frames_and_secs, write_frames
 
     output = ["-preset", "veryfast", "-movflags", "+faststart", "-f", "mp4"]
     frames = write_frames(
@@ -82,12 +85,23 @@ def _writing_mp4(path: Path, size: tuple[int, int], rate: float) -> Iterator[Wri
         output_params=output,
     )
     frames.send(None)
+    count = 0
+
+    def write(image: Image) -> None:
+        nonlocal count
+        frames.send(np.ascontiguousarray(image))
+        count += 1
+
     try:
-        yield lambda image: frames.send(np.ascontiguousarray(image))
+        yield write
     finally:
         frames.close()
-    if not path.exists() or path.stat().st_size == 0:
-        raise OSError(f"{path}: expected ffmpeg to write the movie, got nothing")
+    try:  # imageio-ffmpeg keeps it to itself when ffmpeg fails, e.g. because the disk is full
+        written, _ = count_frames_and_secs(path) if count else (0, 0)
+    except RuntimeError as error:
+        raise OSError(f"{path}: expected ffmpeg to write a movie, got one that cannot be read; is the disk full?") from error
+    if written != count or not count:
+        raise OSError(f"{path}: expected ffmpeg to write {max(count, 1)} pictures, got {written}")
 
 
 @contextmanager

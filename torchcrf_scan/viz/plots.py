@@ -34,6 +34,7 @@ from torchcrf_scan.viz.marks import (
     mover_look,
 )
 from torchcrf_scan.viz.scene import Scene, make_scene
+from torchcrf_scan.whole_file import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -113,7 +114,7 @@ def plot_clusters(pair: ScanPair, predictions: Mapping[str, PairPrediction]) -> 
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: float = 130.0) -> None:
-    """Writes a PNG atomically (a temporary file in the same folder, then a rename); creates missing folders.
+    """Writes a PNG atomically; creates missing folders.
 
     Raises:
         ValueError: `path` does not end in .png.
@@ -122,12 +123,8 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: float = 130.0
     if path.suffix.lower() != ".png":
         raise ValueError(f"path: expected a name ending in .png, got {path.name!r}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        figure.savefig(temporary, format="png", dpi=dpi)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with whole_file(path) as file:
+        figure.savefig(file, format="png", dpi=dpi)
 
 
 # Panels

@@ -12,6 +12,7 @@ from torchcrf_scan.result import ScanResult, Status
 from torchcrf_scan.scan import BACKGROUND, Floats
 from torchcrf_scan.viz.frames import STATUS_COLORS
 from torchcrf_scan.viz.history import STATUSES, Path, StaticMap, Tally, TrackPaths, travelled
+from torchcrf_scan.viz.lettering import drawable
 from torchcrf_scan.viz.marks import INK, NOTE, mover_look
 from torchcrf_scan.viz.scene import Window
 
@@ -24,6 +25,7 @@ LEFT, RIGHT, TOP, BOTTOM, GAP = 0.6, 0.25, 1.0, 0.5, 0.22  # inches around them
 FLATTEST, TALLEST = 0.35, 0.85  # height over width of the map
 MAP = "#9AA3AD"
 LABELS = 40  # tracks with a number at most, the longest
+NARROWEST_BAR = 0.004  # share of the recording; what was seen once is visible
 LEAST_BAR = 0.03  # share of the recording; shorter bars have no number
 LEAST_TRACK = 0.3  # metres; shorter tracks have no number on the map
 
@@ -60,7 +62,7 @@ class Summary:
         bottoms = (BOTTOM + 2 * (GAP + STRIP), BOTTOM + GAP + STRIP, BOTTOM)
         boxes = [np.array([LEFT, bottom, WIDTH, tall]) / size for bottom, tall in zip(bottoms, (height, STRIP, STRIP), strict=True)]
         plane, speed, objects = (figure.add_axes(tuple(box)) for box in boxes)
-        figure.text(LEFT / size[0], 1 - 0.32 / size[1], name, fontsize=15, fontweight="bold", color=INK, parse_math=False)
+        figure.text(LEFT / size[0], 1 - 0.32 / size[1], drawable(name), fontsize=15, fontweight="bold", color=INK, parse_math=False)
         figure.text(LEFT / size[0], 1 - 0.58 / size[1], self.tally.describe(), fontsize=9.5, color=NOTE)
         self._draw_plane(plane, low, high)
         self._draw_speed(speed)
@@ -85,7 +87,7 @@ class Summary:
         longest = sorted(lengths, key=lambda number: -lengths[number])[:LABELS]
         for number, path in self._tracks.paths.items():
             color, way = mover_look(number)[0], path.rows
-            ax.plot(way[:, 1], way[:, 2], color=color, lw=1.5, alpha=0.85, zorder=4)
+            ax.plot(way[:, 1], way[:, 2], color=color, lw=1.5, alpha=0.85, zorder=4, marker="." if len(way) == 1 else None)
             if number in longest and lengths[number] > LEAST_TRACK:
                 label = ax.annotate(
                     str(number), tuple(way[-1, 1:]), (4, 4), textcoords="offset points", color=color, fontsize=8.5, zorder=6
@@ -125,8 +127,9 @@ class Summary:
         ends: list[float] = []  # of the last bar in every lane
         for number, path in sorted(self._tracks.paths.items(), key=lambda item: float(item[1].rows[0, 0])):
             first, last = path.rows[[0, -1], 0] - begin
+            last = max(last, first + NARROWEST_BAR * (end - begin))
             lane = next((k for k, free in enumerate(ends) if free <= first), len(ends))
-            ends[lane : lane + 1] = [last + 0.004 * (end - begin)]
+            ends[lane : lane + 1] = [last + NARROWEST_BAR * (end - begin)]
             ax.broken_barh([(first, last - first)], (lane + 0.1, 0.8), color=mover_look(number)[0], lw=0)
             if last - first > LEAST_BAR * (end - begin):
                 place = ((first + last) / 2, lane + 0.47)

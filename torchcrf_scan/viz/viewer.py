@@ -6,7 +6,6 @@ that does not take in time is left out: a viewer that is slow, stuck or closed n
 
 from __future__ import annotations
 
-import importlib.util
 import multiprocessing
 import queue
 import signal
@@ -37,8 +36,10 @@ Show = Callable[[ScanResult], None]
 
 def check_viewer(option: str) -> None:
     """Raises ValueError if the extra `viewer` is not installed."""
-    if importlib.util.find_spec("rerun") is None:
-        raise ValueError(f"{option}: expected the extra torchcrf-scan[viewer] to be installed, got no module named rerun")
+    try:
+        import rerun  # noqa: F401
+    except ImportError as error:
+        raise ValueError(f"{option}: expected the extra torchcrf-scan[viewer] to be installed, got {error}") from error
 
 
 @contextmanager
