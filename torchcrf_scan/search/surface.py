@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcrf_scan.features.free_space import WIDEST_GAP
+from torchcrf_scan.inference.directions import LEAST_TURN
 from torchcrf_scan.loops.circle import polar, rising_bearing, rising_turn, turn_apart
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
 from torchcrf_scan.loops.median import lower_median
@@ -63,7 +64,7 @@ def usual_step(turn: Array) -> float:
     """Radians: the lower median of the turns (P,) to the next beam, without the last one and those to a return of the same beam."""
     beams, count = np.empty(len(turn)), 0
     for i in range(len(turn) - 1):
-        if turn[i] > 0:
+        if turn[i] >= LEAST_TURN:
             beams[count] = turn[i]
             count += 1
     return lower_median(beams[:count]) if count > 0 else math.radians(0.5)
