@@ -135,7 +135,7 @@ def pieces(scan: Surface) -> list[int]:
 
 def sight(scan: Surface, place: Point) -> str:
     """What a scan's beams say of a point: `seen through`, `occluded`, `unmeasured` or `agrees`."""
-    about = oracles.beams_about(scan.as_scan, place)
+    about = oracles.beams_about(scan.as_scan, place, scan.step)
     if about is None:
         return "occluded"
     near, far, is_measured, slack = about
