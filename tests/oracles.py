@@ -222,13 +222,17 @@ def pairwise_clustering(
 Scan = tuple[Sequence[Sequence[float]], Sequence[float], bool, float]
 
 
-def beams_about(scan: Scan, point: Sequence[float]) -> tuple[float, float, bool, float] | None:
-    """Nearer and farther range of the beams beside a point, whether they are close enough to tell, and the slack; None: outside."""
+def beams_about(scan: Scan, point: Sequence[float], step: float | None = None) -> tuple[float, float, bool, float] | None:
+    """Nearer and farther range of the beams beside a point, whether they are close enough to tell, and the slack; None: outside.
+
+    step: radians between beams; None: the lower median of all turns.
+    """
     points, origin, closed, noise = scan
     arms = [(p[0] - origin[0], p[1] - origin[1]) for p in points]
     ranges, bearings = [math.hypot(*arm) for arm in arms], [math.atan2(arm[1], arm[0]) for arm in arms]
     turns = [(after - before) % (2 * math.pi) for before, after in itertools.pairwise(bearings)]
-    step = sorted(turns)[(len(turns) - 1) // 2] if turns else math.radians(0.5)
+    if step is None:
+        step = sorted(turns)[(len(turns) - 1) // 2] if turns else math.radians(0.5)
     arm = (point[0] - origin[0], point[1] - origin[1])
     mine = math.hypot(*arm)
     onward = (math.atan2(arm[1], arm[0]) - bearings[0]) % (2 * math.pi)  # from the first beam

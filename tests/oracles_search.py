@@ -86,7 +86,7 @@ def surface(points: np.ndarray, noise: float, closed: bool, origin: Point = (0.0
     for before, after in itertools.pairwise(raw):
         bearings.append(bearings[-1] + rising(after - before))
     turns = [rising(bearings[(i + 1) % P] - bearings[i]) for i in range(P)]
-    step = lower_median(turns[:-1]) if P > 1 else math.radians(0.5)
+    step = lower_median([turn for turn in turns[:-1] if turn >= 1e-9] or [math.radians(0.5)])
     gaps = [math.dist(points[i], points[(i + 1) % P]) for i in range(P)]
     joined = []
     for i in range(P):
@@ -96,13 +96,21 @@ def surface(points: np.ndarray, noise: float, closed: bool, origin: Point = (0.0
     spacing, length, tangent = [], [], []
     for i in range(P):
         footprint = ranges[i] * step
-        beside = [(gaps[k], points[(k + 1) % P] - points[k]) for k in (i - 1, i) if joined[k]]
+        edges = [next_edge(i - 1, -1, gaps, joined), next_edge(i, 1, gaps, joined)]
+        beside = [(gaps[k], points[(k + 1) % P] - points[k]) for k in edges if joined[k]]
         spacing.append(min((gap for gap, _ in beside), default=footprint))
         length.append((sum(gap for gap, _ in beside) + (2 - len(beside)) * footprint) / 2)
         x, y = sum((arm for _, arm in beside), np.zeros(2))
         size = max(math.hypot(x, y), 1e-9)
         tangent.append((x / size, y / size))
     return Surface(points, origin, noise, closed, ranges, bearings, step, joined, spacing, length, tangent, numbered(joined))
+
+
+def next_edge(k: int, direction: int, gaps: Sequence[float], joined: Sequence[bool]) -> int:
+    """The first edge from k on, one way, that leads to a point elsewhere or off the surface."""
+    P = len(gaps)
+    ways = [(k + direction * n) % P for n in range(P)]
+    return next((way for way in ways if gaps[way] > 0 or not joined[way]), k % P)
 
 
 def numbered(joined: Sequence[bool]) -> list[int]:
@@ -127,7 +135,7 @@ def pieces(scan: Surface) -> list[int]:
 
 def sight(scan: Surface, place: Point) -> str:
     """What a scan's beams say of a point: `seen through`, `occluded`, `unmeasured` or `agrees`."""
-    about = oracles.beams_about(scan.as_scan, place)
+    about = oracles.beams_about(scan.as_scan, place, scan.step)
     if about is None:
         return "occluded"
     near, far, is_measured, slack = about

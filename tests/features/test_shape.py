@@ -135,9 +135,17 @@ def test_local_spacing_does_not_cross_a_jump() -> None:
     bearings = torch.tensor([-0.2, -0.1, 0.0, 0.1, 0.2], dtype=torch.float64)
     points = polar(torch.tensor([2.0, 2.0, 2.0, 8.0, 8.0], dtype=torch.float64), bearings)
     near, far = 4 * math.sin(0.05), 16 * math.sin(0.05)  # chords
-    assert_close(local_spacing(describe_one(points))[0], [near, near, near, far, far])
+    assert_close(local_spacing(describe_one(points), all_real(points)[None])[0], [near, near, near, far, far])
 
 
 def test_local_spacing_of_a_point_met_twice() -> None:
     points = torch.tensor([[1.0, 0.0], [1.0, 0.0], [1.0, 0.5]], dtype=torch.float64)
-    assert_close(local_spacing(describe_one(points))[0], [0.0, 0.5, 0.5])
+    assert_close(local_spacing(describe_one(points), all_real(points)[None])[0], [0.5, 0.5, 0.5])
+
+
+def test_local_spacing_goes_to_the_next_distinct_point() -> None:
+    once = make_points(9, 4)
+    spacing = local_spacing(describe_one(once), all_real(once)[None])[0]
+    for times in (2, 3, 4):
+        points = once.repeat_interleave(times, 0)
+        assert_close(local_spacing(describe_one(points), all_real(points)[None])[0], spacing.repeat_interleave(times))

@@ -9,11 +9,12 @@ import numpy as np
 
 from torchcrf_scan.fast.motion import POINT, Members, members_of, places_of
 from torchcrf_scan.fast.robust import robust_weight
-from torchcrf_scan.inference.uncertainty import MOST_CERTAIN, NEIGHBOURS, NOTHING, RUN, STEPS, STRETCH, TINY, WITHIN
-from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
+from torchcrf_scan.inference.uncertainty import BENT, COARSE, EMPTY, MOST_CERTAIN, NOTHING, RUN, SHARED, TINY, WITHIN
+from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.rigid import rotate, transform, transform_of
 from torchcrf_scan.loops.solve import axes_of, inverse_of, product
 from torchcrf_scan.prediction import LEAST_SHARE
+from torchcrf_scan.search.directions import Directions, directions_of
 
 EXCLUDED = math.exp(2 * MOST_CERTAIN)  # belief of a state in the sum that excludes it
 
@@ -34,49 +35,10 @@ class Fit(NamedTuple):
 
 
 @kernel
-def surface_tangents(points: Array, mask: Booleans, noise: float) -> tuple[Array, Booleans]:
-    """(N, 2) direction of the surface at every point, from a stretch long compared with the noise, and (N,) whether it is defined.
-
-    points: (N, 2) in beam order. mask: (N,) points to use.
-    """
-    N = len(points)
-    tangent, is_found = np.zeros((N, 2)), np.zeros(N, np.bool_)
-    for i in range(N):
-        if not mask[i]:
-            continue
-        low, high = max(i - NEIGHBOURS, 0), min(i + NEIGHBOURS + 1, N)
-        nearest = np.inf
-        for j in range(low, high):
-            if mask[j] and j != i:
-                nearest = min(nearest, (points[j, 0] - points[i, 0]) ** 2 + (points[j, 1] - points[i, 1]) ** 2)
-        if nearest == np.inf:
-            continue
-        stretch = (STRETCH * noise) ** 2 + STEPS**2 * nearest
-        total = mx = my = 0.0
-        for j in range(low, high):
-            if mask[j]:
-                x, y = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
-                w = max(1 - (x * x + y * y) / stretch, 0.0)
-                total, mx, my = total + w, mx + w * x, my + w * y
-        total = max(total, 1e-9)
-        mx, my = mx / total, my / total
-        xx = yy = xy = 0.0
-        for j in range(low, high):
-            if mask[j]:
-                x, y = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
-                w = max(1 - (x * x + y * y) / stretch, 0.0) / total
-                xx, yy, xy = xx + w * (x - mx) ** 2, yy + w * (y - my) ** 2, xy + w * (x - mx) * (y - my)
-        angle = math.atan2(2 * xy, xx - yy) / 2 if xy != 0 or xx != yy else 0.0
-        tangent[i, 0], tangent[i, 1] = math.cos(angle), math.sin(angle)
-        is_found[i] = xx + yy > 0
-    return tangent, is_found
-
-
-@kernel
 def linearise(
-    members: Members, places: Integers, motion: Array, metric: int, scale: float, noise: float, tangent: Array, is_found: Booleans
+    members: Members, places: Integers, motion: Array, metric: int, scale: float, noise: float, surface: Directions
 ) -> Fit:
-    """A cluster's fit at its motion. tangent, is_found: of all source points, output of `surface_tangents`."""
+    """A cluster's fit at its motion. surface: of all source points."""
     P = len(places)
     by = transform_of(motion)
     weights, residual, arm, centre = np.ones(P), np.empty((P, 2)), np.empty((P, 2)), np.zeros(2)
@@ -101,8 +63,8 @@ def linearise(
         ux = uy = 0.0
         if metric != POINT:
             ux, uy = members.tangent[p, 0], members.tangent[p, 1]
-            if is_found[places[p]] and (ux != 0 or uy != 0):
-                ux, uy = rotate(by, tangent[places[p], 0], tangent[places[p], 1])
+            if surface.is_found[places[p]] and (ux != 0 or uy != 0 or surface.is_straight[places[p]]):
+                ux, uy = rotate(by, surface.tangent[places[p], 0], surface.tangent[places[p], 1])
         lx, ly = -arm[p, 1] / length, arm[p, 0] / length
         along = ux * lx + uy * ly
         jacobian[p, 0, 0], jacobian[p, 1, 0] = lx - ux * along, ly - uy * along
@@ -151,7 +113,7 @@ class Sums(NamedTuple):
 
     Attributes:
         score: (P, 3) w J^T r of every point; step: (3,) their sum. normal: (3, 3) w J^T J, apart: (3, 3) w^2 J^T J, both symmetric.
-        total: of the weights. variance: of a residual.
+        total: of the weights. variance: of a residual. spread: mean squared residual.
     """
 
     score: Array
@@ -160,6 +122,7 @@ class Sums(NamedTuple):
     apart: Array
     total: float
     variance: float
+    spread: float
 
 
 @kernel
@@ -184,7 +147,19 @@ def sums_of(fit: Fit, noise: float) -> Sums:
     for r in range(3):
         for d in range(r):
             normal[r, d], apart[r, d] = normal[d, r], apart[d, r]
-    return Sums(score, step, normal, apart, max(total, 1e-9), max(2 * noise**2, squares / max(free, 1e-9)))
+    spread = squares / max(free, 1e-9)
+    return Sums(score, step, normal, apart, max(total, 1e-9), max(2 * noise**2, spread), spread)
+
+
+@kernel
+def shared_error(fit: Fit, places: Integers, spread: float, noise: float, surface: Directions) -> float:
+    """Squared error of a motion that all its points share; `inference.uncertainty`. places: (P,). spread: mean squared residual."""
+    sampled = free = 0.0
+    for p in range(len(places)):
+        share = fit.weights[p] * fit.freedom[p]
+        sampled, free = sampled + share * surface.spacing[places[p]] ** 2, free + share
+    beyond = spread - noise**2
+    return max(beyond if surface.step >= COARSE else SHARED**2 * (beyond - BENT**2 * sampled / max(free, 1e-9)), 0.0)
 
 
 @kernel
@@ -211,13 +186,14 @@ def projection_on(information: Array, directions: Array) -> Array:
 
 @kernel
 def cluster_covariance(
-    fit: Fit, places: Integers, motion: Array, metric: int, noise: float, reach: float
+    fit: Fit, places: Integers, motion: Array, metric: int, noise: float, reach: float, surface: Directions
 ) -> tuple[Array, Array, Array]:
     """(3, 3) covariance, (3,) information and (3, 3) directions of one motion, as `inference.uncertainty` defines them.
 
     Args:
         places: (P,) the cluster's points, ascending. motion: (3,). metric: POINT, else point-to-line.
         noise: standard deviation of a return. reach: largest distance of a source point from the sensor.
+        surface: of all source points.
     """
     sums = sums_of(fit, noise)
     normal, total = sums.normal, sums.total
@@ -238,7 +214,12 @@ def cluster_covariance(
     known[1, 1] += 1 / reach**2
     known[2, 2] += 1 / reach**2
     x, y = motion[1] - fit.centre[0], motion[2] - fit.centre[1]
-    return about_origin(inverse_of(known), fit.length, x, y), information, directions
+    local = inverse_of(known)
+    if metric != POINT:
+        shared = shared_error(fit, places, sums.spread, noise, surface)
+        for r in range(3):
+            local[r, r] += shared
+    return about_origin(local, fit.length, x, y), information, directions
 
 
 @kernel
@@ -279,17 +260,17 @@ def motion_covariance(
     for i in range(N):
         reach = max(reach, source[i, 0] ** 2 + source[i, 1] ** 2)
         mask[i] = cluster[i] >= 0 and association[i] >= 0
-    reach = max(math.sqrt(reach), 1e-3)
+    reach = max(math.sqrt(reach) if reach > 0 else EMPTY * noise, 1e-3)
     noise = max(noise, TINY * reach)
     if metric == POINT:
         mask[:] = False
-    tangent, is_found = surface_tangents(source, mask, noise)
+    surface = directions_of(source, mask, noise)
     covariance, information, directions = np.empty((C, 3, 3)), np.empty((C, 3)), np.empty((C, 3, 3))
     for c in range(C):
         places = places_of(association, cluster, c)
         members = members_of(source, target, tangents, association, places)
-        fit = linearise(members, places, motions[c], metric, scale, noise, tangent, is_found)
-        covariance[c], information[c], directions[c] = cluster_covariance(fit, places, motions[c], metric, noise, reach)
+        fit = linearise(members, places, motions[c], metric, scale, noise, surface)
+        covariance[c], information[c], directions[c] = cluster_covariance(fit, places, motions[c], metric, noise, reach, surface)
     return covariance, information, directions
 
 

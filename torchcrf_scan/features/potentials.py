@@ -135,7 +135,7 @@ def resolution(batch: ScanPairBatch) -> Tensor:
     spacing = []
     for points, mask in ((batch.source, batch.source_mask), (batch.target, batch.target_mask)):
         open_ended = torch.zeros_like(batch.source_closed)
-        spacing.append(local_spacing(describe(points, mask, open_ended)).masked_fill(~mask, torch.nan))
+        spacing.append(local_spacing(describe(points, mask, open_ended), mask).masked_fill(~mask, torch.nan))
     usual = torch.cat(spacing, dim=1).nanmedian(-1).values.nan_to_num(nan=0.1)
     return usual / 2 + 2 * batch.range_noise
 

@@ -73,7 +73,19 @@ def _angle(u: Tensor, v: Tensor) -> Tensor:
     return torch.where(short, torch.full_like(angle, torch.pi), angle)
 
 
-def local_spacing(shape: ShapeDescriptors) -> Tensor:
-    """(B, N) metres between a point and the next on its own surface: to the nearer neighbour, so not across a depth jump."""
-    nearest = shape.distance[:, :, 0]  # (B, N, 2)
+def local_spacing(shape: ShapeDescriptors, mask: Tensor) -> Tensor:
+    """(B, N) metres between a point and the nearer of the next distinct ones on either side, so not across a depth jump.
+
+    0 if all points coincide. shape: of scans regarded as open. mask: (B, N).
+    """
+    after, before = shape.distance[:, :, 0].masked_fill(~mask[..., None], 0.0).unbind(-1)  # (B, N)
+    N = mask.shape[1]
+    place = torch.arange(N, device=mask.device).expand_as(mask)
+    ahead = place.masked_fill(after == 0, N).flip(-1).cummin(-1).values.flip(-1)
+    behind = place.masked_fill(before == 0, -1).cummax(-1).values
+    gaps = [
+        torch.where(ahead < N, after.gather(-1, ahead.clamp(max=N - 1)), 0.0),
+        torch.where(behind >= 0, before.gather(-1, behind.clamp(min=0)), 0.0),
+    ]
+    nearest = torch.stack(gaps, -1)
     return torch.where(nearest.amin(-1) > 0, nearest.amin(-1), nearest.amax(-1))

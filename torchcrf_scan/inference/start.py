@@ -11,7 +11,7 @@ from torchcrf_scan.batch import ScanPairBatch, scale_motions
 from torchcrf_scan.features.candidates import squared_distances
 from torchcrf_scan.features.potentials import possible_clusters
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.uncertainty import surface_tangents
+from torchcrf_scan.inference.directions import surface_tangents
 from torchcrf_scan.tree import tensor_tree
 
 ASSOCIATION_GATE = 3.0  # units of footprint and noise beyond which a point has no associate

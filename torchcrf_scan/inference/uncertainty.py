@@ -4,10 +4,14 @@ A motion's errors come from more than the sensor's noise: returns sample a surfa
 and the fit stops early. So the covariance uses the larger of residuals and sensor noise, and is that of a sum of correlated
 scores (a sandwich estimator). Noise in the directions of surfaces must not count as information: along a corridor every noisy
 tangent seems to constrain the motion. Tangents are therefore estimated anew, from stretches long compared with the noise.
+
+Scans that are skewed, by turning while they are swept, fit none the better for more points: what noise and sampling do not explain
+of the residuals tells how much, and is an error of the motion as a whole.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,15 +20,17 @@ from torch import Tensor, nn
 
 from torchcrf_scan.choices import MOTION_METRICS
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.geometry.kabsch import safe_atan2
+from torchcrf_scan.inference.directions import is_straight, spacing_of, surface_runs, surface_tangents, usual_turn
 from torchcrf_scan.inference.motion import Support
 from torchcrf_scan.prediction import LEAST_SHARE, Uncertainty
 
-STRETCH, STEPS = 10.0, 2.0  # a surface's direction comes from the points within this many noises and steps to the next point
-NEIGHBOURS = 8  # on either side, at most
 RUN = 48  # neighbouring points with possibly correlated errors: a jolt lasts several degrees
 NOTHING = 1e-3  # of a point's information, so that no matrix is singular
 TINY = 1e-6  # of the scene's extent: the least noise
+EMPTY = 1000.0  # noises: the extent of a scene without points, some ten metres
+SHARED = 3.0  # factor on the residual that noise and sampling do not explain, in an error that all points share,
+BENT = 0.05  # of the spacing: distance of a surface from the straight line between two returns, as sampling explains it
+COARSE = math.radians(4.0)  # between beams: neighbours do not sample a surface, and all of the residual is shared, with factor 1
 MOST_CERTAIN = -50.0  # log-beliefs below this are treated as impossible
 WITHIN = 2  # target points; nearer associations count as equal, since annotations err by one themselves
 
@@ -40,10 +46,10 @@ def motion_covariance(
         1 / RUN sum over runs of points of (sum g) (sum g)^T     errors shared by neighbours
         (sum_i g_i) (sum_i g_i)^T                            the remaining step: the fit stopped before convergence.
 
-    Independent errors are counted up to twice, and errors hidden by the choice of partners are not counted;
-    `Calibration.covariance_factor` corrects for both. A direction with less information than `LEAST_SHARE` has only a prior: no
-    point moves farther than the scene's extent, and a rotation is arbitrary. Differentiable at a fixed set of these directions.
-    O(B C N).
+    To it comes the error that all points share (`shared_error`), alike in all directions. Independent errors are counted up to
+    twice, and errors hidden by the choice of partners are not counted: `Calibration.covariance_factor` corrects for both. A
+    direction with less information than `LEAST_SHARE` has only a prior: no point moves farther than the scene's extent, and a
+    rotation is arbitrary. Differentiable at a fixed set of these directions. O(B C N).
 
     Args:
         source: (B, N, 2) in beam order, N >= 1. support: of the last fit. motions: (B, C, 3) its result.
@@ -51,7 +57,8 @@ def motion_covariance(
         scale: () or (B,) residual at which a robust weight is one half. noise: (B,) standard deviation of a range.
             Both in the unit of the points.
     """
-    reach = torch.linalg.vector_norm(source, dim=-1).detach().amax(-1).clamp(min=1e-3)  # (B,)
+    reach = torch.linalg.vector_norm(source, dim=-1).detach().amax(-1)  # (B,)
+    reach = torch.where(reach > 0, reach, EMPTY * noise).clamp(min=1e-3)
     noise = noise.maximum(TINY * reach)
     at = Linearisation.of(source, support, motions, metric, scale, noise)
     total = at.weights.sum(-1).clamp(min=1e-9)  # (B, C)
@@ -75,8 +82,25 @@ def motion_covariance(
     length = at.length.double()
     prior = torch.stack([3 / (torch.pi * length) ** 2, *(1 / reach[:, None] ** 2).expand(2, *length.shape)], -1).diag_embed()
     local = torch.linalg.inv(bread @ torch.linalg.inv(meat) @ bread + prior)
+    if MOTION_METRICS[metric].along_surface:
+        local = local + shared_error(source, at, spread, noise)[..., None, None].double() * identity
     covariance = about_origin(local, length, (motions[..., 1:] - at.centre).double())
     return Uncertainty(covariance.to(source), information.to(source), vectors.mT.to(source))
+
+
+def shared_error(source: Tensor, at: Linearisation, spread: Tensor, noise: Tensor) -> Tensor:
+    """(B, C) squared error of the motions that all their points share: what noise and sampling do not explain of the residuals.
+
+    A coarse scan's points are partners of their own beams' next readings, which hides a part of the motion.
+
+    Args:
+        source: (B, N, 2). spread: (B, C) mean squared residual. noise: (B,).
+    """
+    step, near = usual_turn(source.detach()), spacing_of(source.detach())  # (B, 1), (B, N)
+    free = at.weights * at.freedom
+    sampled = (free * near[:, None] ** 2).sum(-1) / free.sum(-1).clamp(min=1e-9)
+    beyond = spread - noise[:, None] ** 2  # of a return
+    return torch.where(step >= COARSE, beyond, SHARED**2 * (beyond - BENT**2 * sampled)).clamp(min=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,11 +145,16 @@ class Linearisation:
 
 
 def moved_tangents(source: Tensor, support: Support, motions: Tensor, noise: Tensor) -> Tensor:
-    """(B, C, N, 2) direction of the surface under every motion; 0 for an isolated partner. Arguments as in `motion_covariance`."""
-    tangent, is_found = surface_tangents(source, support.weights.sum(1) > 0, noise)
+    """(B, C, N, 2) direction of the surface under every motion; 0 for an isolated partner. Arguments as in `motion_covariance`.
+
+    Far away, where a wall is seen at a grazing angle, its returns are isolated; in line with their neighbours they are no ends.
+    """
+    run = surface_runs(source.detach(), noise)
+    tangent, is_found = surface_tangents(source, support.weights.sum(1) > 0, noise, run)
     turned = se2.rotate(motions[..., :1], tangent[:, None])
     given = support.tangent[:, None]
-    return torch.where(is_found[:, None, :, None] & (given != 0).any(-1, keepdim=True), turned, given)
+    is_surface = (given != 0).any(-1) | is_straight(source.detach(), run, noise)[:, None]  # (B, 1, N)
+    return torch.where((is_found[:, None] & is_surface)[..., None], turned, given)
 
 
 def about_origin(local: Tensor, length: Tensor, offset: Tensor) -> Tensor:
@@ -150,32 +179,6 @@ def shared_scores(score: Tensor) -> Tensor:
     padded = nn.functional.pad(flat, (RUN - 1, RUN - 1))
     runs = RUN * nn.functional.avg_pool1d(padded, RUN, stride=1)  # (B C, 3, N + RUN - 1)
     return (runs @ runs.mT / RUN).unflatten(0, score.shape[:2])
-
-
-def surface_tangents(points: Tensor, mask: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Direction of the surface at every point, from a stretch that is long compared with the noise.
-
-    Args:
-        points: (B, N, 2) in beam order. mask: (B, N) points to use. noise: (B,) metres.
-
-    Returns:
-        (B, N, 2) unit vectors along the main axis of the neighbouring points, and (B, N) whether there is such an axis.
-    """
-    padded = nn.functional.pad(points, (0, 0, NEIGHBOURS, NEIGHBOURS)).unfold(1, 2 * NEIGHBOURS + 1, 1)  # (B, N, 2, W)
-    real = nn.functional.pad(mask, (NEIGHBOURS, NEIGHBOURS)).unfold(1, 2 * NEIGHBOURS + 1, 1) & mask[..., None]
-    arm = padded.mT - points[..., None, :]  # (B, N, W, 2)
-    squared = (arm**2).sum(-1)
-    others = real & (torch.arange(2 * NEIGHBOURS + 1, device=points.device) != NEIGHBOURS)
-    is_found = others.any(-1)
-    nearest = squared.masked_fill(~others, torch.inf).amin(-1).masked_fill(~is_found, 0.0)
-    stretch = (STRETCH * noise[:, None]) ** 2 + STEPS**2 * nearest
-    kernel = (1 - squared / stretch[..., None]).clamp(min=0) * real
-    share = (kernel / kernel.sum(-1, keepdim=True).clamp(min=1e-9))[..., None]
-    spread = arm - (share * arm).sum(-2, keepdim=True)
-    xx, yy = (share * spread**2).sum(-2).unbind(-1)
-    xy = (share[..., 0] * spread[..., 0] * spread[..., 1]).sum(-1)
-    angle = safe_atan2(2 * xy, xx - yy) / 2
-    return torch.stack([angle.cos(), angle.sin()], -1), is_found & (xx + yy > 0)
 
 
 class Answers(Protocol):

@@ -75,29 +75,23 @@ def describe(points: Array, is_closed: bool) -> Shape:
 
 
 @kernel
-def nearer_gap(after: float, before: float) -> float:
-    """The smaller of the distances to a point's two neighbours, ignoring coincident ones and those beyond the scan's end."""
-    return min(after, before) if min(after, before) > 0 else max(after, before)
-
-
-@kernel
-def local_spacing(shape: Shape) -> Array:
-    """(P,) metres between a point and the next on its own surface: to the nearer neighbour, so not across a depth jump."""
-    spacing = np.empty(len(shape.distance))
-    for i in range(len(spacing)):
-        spacing[i] = nearer_gap(shape.distance[i, 0, 0], shape.distance[i, 0, 1])
-    return spacing
-
-
-@kernel
 def _open_spacing(points: Array, into: Array) -> None:
-    """`local_spacing` of a scan regarded as open. points: (P, 2); into: (P,)."""
-    before = 0.0
-    for i in range(len(points)):
-        j = neighbour(i, 1, len(points), False)
-        after = math.sqrt((points[j, 0] - points[i, 0]) ** 2 + (points[j, 1] - points[i, 1]) ** 2)
-        into[i] = nearer_gap(after, before)
-        before = after
+    """Writes metres (P,) between a point (P, 2) and the nearer of the next distinct ones on either side: not across a jump.
+
+    The scan is regarded as open; 0 if all points coincide.
+    """
+    P, gap = len(points), 0.0
+    for i in range(P):  # from behind
+        if i > 0:
+            step = math.sqrt((points[i, 0] - points[i - 1, 0]) ** 2 + (points[i, 1] - points[i - 1, 1]) ** 2)
+            gap = step if step > 0 else gap
+        into[i] = gap
+    gap = 0.0
+    for i in range(P - 1, -1, -1):  # from ahead
+        if i + 1 < P:
+            step = math.sqrt((points[i + 1, 0] - points[i, 0]) ** 2 + (points[i + 1, 1] - points[i, 1]) ** 2)
+            gap = step if step > 0 else gap
+        into[i] = min(into[i], gap) if min(into[i], gap) > 0 else max(into[i], gap)
 
 
 @entry

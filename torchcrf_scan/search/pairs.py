@@ -28,6 +28,7 @@ from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.pool import Share, alone, find_background
 from torchcrf_scan.search.survey import Survey, grids_of, survey_at
 from torchcrf_scan.search.trusted import choose_background
+from torchcrf_scan.search.unobserved import less_turned, settle
 
 T = TypeVar("T")
 
@@ -79,7 +80,9 @@ def find_start(pair: Pair, share: Share) -> tuple[ScanGrid, ScanGrid, Array]:
     source, target = grids_of(pair)
     is_led, background = follow(pair.initial_motion, source, target) if pair.initial_motion.any() else (False, pair.initial_motion)
     found = background if is_led else find_background(source, target, pair.initial_motion, share)
-    return source, target, choose_background(found, pair.initial_motion, source, target).motion
+    found = less_turned(source, target, found, pair.initial_motion)
+    backed = choose_background(found, pair.initial_motion, source, target)
+    return settle(source, target, backed.motion, backed.explained, pair.initial_motion)
 
 
 def start_pair(pair: Pair, score: Score, clusters: int, share: Share = alone, expected: Expected | None = None) -> PairStart:

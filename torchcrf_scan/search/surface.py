@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcrf_scan.features.free_space import WIDEST_GAP
+from torchcrf_scan.inference.directions import LEAST_TURN
 from torchcrf_scan.loops.circle import polar, rising_bearing, rising_turn, turn_apart
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
 from torchcrf_scan.loops.median import lower_median
@@ -58,6 +59,32 @@ def number_runs(joined: Booleans) -> Integers:
     return number
 
 
+@kernel
+def usual_step(turn: Array) -> float:
+    """Radians: the lower median of the turns (P,) to the next beam, without the last one and those to a return of the same beam."""
+    beams, count = np.empty(len(turn)), 0
+    for i in range(len(turn) - 1):
+        if turn[i] >= LEAST_TURN:
+            beams[count] = turn[i]
+            count += 1
+    return lower_median(beams[:count]) if count > 0 else math.radians(0.5)
+
+
+@kernel
+def distinct_neighbour(i: int, gap: Array, joined: Booleans, direction: int) -> int:
+    """The nearest point ahead (1) or behind (-1) of point i on its surface that is elsewhere; the last one tried if there is none.
+
+    gap: (P,) to the next point. joined: (P,) on one surface with it.
+    """
+    P, j = len(gap), i
+    for _ in range(P):
+        edge = j if direction > 0 else (j - 1) % P
+        j = (j + direction) % P
+        if gap[edge] > 0 or not joined[edge]:
+            break
+    return j
+
+
 @entry
 def surface_of(points: Array, noise: float, is_closed: bool, origin: Array) -> Surface:
     """The surface of (P, 2) points in beam order, P >= 1. noise: metres; origin: (2,) of the sensor."""
@@ -68,7 +95,7 @@ def surface_of(points: Array, noise: float, is_closed: bool, origin: Array) -> S
         j = (i + 1) % P
         gap[i] = math.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
         turn[i] = rising_turn(bearings[j] - bearings[i])
-    step = lower_median(turn[:-1]) if P > 1 else math.radians(0.5)
+    step = usual_step(turn)
     joined = np.empty(P, np.bool_)
     for i in range(P):
         least = min(ranges[i], ranges[(i + 1) % P])
@@ -78,17 +105,18 @@ def surface_of(points: Array, noise: float, is_closed: bool, origin: Array) -> S
         joined[P - 1] = False
     spacing, length, tangent = np.empty(P), np.empty(P), np.empty((P, 2))
     for i in range(P):
-        j, k = (i + 1) % P, (i - 1) % P
+        j, k = distinct_neighbour(i, gap, joined, 1), distinct_neighbour(i, gap, joined, -1)
+        ahead = (j - 1) % P  # the edge to the next point elsewhere, k the one from the last
         footprint = ranges[i] * step
-        nearest = min(gap[i] if joined[i] else np.inf, gap[k] if joined[k] else np.inf)
+        nearest = min(gap[ahead] if joined[ahead] else np.inf, gap[k] if joined[k] else np.inf)
         spacing[i] = nearest if nearest < np.inf else footprint
         ax = ay = 0.0
         length[i] = 0.0
-        if joined[i]:
+        if joined[ahead]:
             ax, ay = ax + points[j, 0] - points[i, 0], ay + points[j, 1] - points[i, 1]
         if joined[k]:
             ax, ay = ax + points[i, 0] - points[k, 0], ay + points[i, 1] - points[k, 1]
-        length[i] = (gap[i] if joined[i] else footprint) / 2 + (gap[k] if joined[k] else footprint) / 2
+        length[i] = (gap[ahead] if joined[ahead] else footprint) / 2 + (gap[k] if joined[k] else footprint) / 2
         arm = max(math.sqrt(ax * ax + ay * ay), 1e-9)
         tangent[i, 0], tangent[i, 1] = ax / arm, ay / arm
     segment = number_runs(joined)
