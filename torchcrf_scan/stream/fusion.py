@@ -11,7 +11,6 @@ from torchcrf_scan.scan import Floats
 from torchcrf_scan.stream.covariance import turned
 
 ACCELERATION = (20.0, 10.0, 10.0)  # rad/s^2 and m/s^2, standard deviations of what constant velocity does not foresee
-DOUBT = 4.0  # factor on the covariance of a measured pose: errors of real scanners are larger than promised
 
 SETTLING = 1.0  # seconds whose poses are averaged of a sensor that stands
 MOST_POSES = 100  # that are remembered
@@ -29,7 +28,7 @@ def fused(predicted: Floats, measured: Floats, covariance: Floats, elapsed: floa
     """
     ahead = se2.compose(se2.inverse(predicted), measured)
     prior = np.diag(np.square(np.array(ACCELERATION) * elapsed**2 / 2))
-    gain = np.linalg.solve(prior + DOUBT * turned(covariance, -float(predicted[0])), prior).T
+    gain = np.linalg.solve(prior + turned(covariance, -float(predicted[0])), prior).T
     return se2.compose(predicted, gain @ ahead)
 
 

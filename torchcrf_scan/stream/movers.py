@@ -10,7 +10,7 @@ import numpy as np
 
 from torchcrf_scan.result import MovingObject
 
-CERTAIN = 1.5  # standard deviations of the speed, above which an object seems to move,
+CERTAIN = 1.75  # standard deviations of the speed, above which an object seems to move,
 REPEATED = 2  # in so many sightings in a row,
 PROGRESS = 0.3  # if its place went at least this share of the way that its velocity tells,
 WINDOW = 0.6  # in so many seconds,
