@@ -175,13 +175,26 @@ class PlainOperators(TorchFunctionMode):
         """The function itself, or its replacement."""
         if func is torch._C._set_grad_enabled and args[0] == torch.is_grad_enabled():
             return None
-        own = {torch.searchsorted: count_below, Tensor.nanmedian: middle_of_known, torch.linalg.solve_ex: eliminate}
+        own = {
+            torch.searchsorted: count_below,
+            Tensor.nanmedian: middle_of_known,
+            Tensor.cummax: largest_so_far,
+            torch.linalg.solve_ex: eliminate,
+        }
         return own.get(func, func)(*args, **(kwargs or {}))
 
 
 def count_below(sorted_sequence: Tensor, values: Tensor) -> Tensor:
     """`torch.searchsorted` from the left, by comparing every value with every entry. sorted_sequence: (R, M); values: (R, P)."""
     return (sorted_sequence[:, None] < values[..., None]).sum(-1)
+
+
+def largest_so_far(values: Tensor, dim: int) -> torch.return_types.cummax:
+    """`torch.cummax` of whole numbers along the last dimension, by comparing every place with every one, and where they are."""
+    assert dim == -1
+    place = torch.arange(values.shape[-1], device=values.device)
+    known = values[..., None, :].masked_fill(place > place[:, None], torch.iinfo(values.dtype).min)
+    return torch.return_types.cummax((known.amax(-1), known.argmax(-1)))
 
 
 def middle_of_known(values: Tensor, dim: int, *, keepdim: bool = False) -> torch.return_types.nanmedian:

@@ -80,12 +80,16 @@ def local_spacing(shape: ShapeDescriptors, mask: Tensor) -> Tensor:
     """
     after, before = shape.distance[:, :, 0].masked_fill(~mask[..., None], 0.0).unbind(-1)  # (B, N)
     N = mask.shape[1]
-    place = torch.arange(N, device=mask.device).expand_as(mask)
-    ahead = place.masked_fill(after == 0, N).flip(-1).cummin(-1).values.flip(-1)
-    behind = place.masked_fill(before == 0, -1).cummax(-1).values
+    ahead = N - 1 - _last_before((after > 0).flip(-1)).flip(-1)
+    behind = _last_before(before > 0)
     gaps = [
         torch.where(ahead < N, after.gather(-1, ahead.clamp(max=N - 1)), 0.0),
         torch.where(behind >= 0, before.gather(-1, behind.clamp(min=0)), 0.0),
     ]
     nearest = torch.stack(gaps, -1)
     return torch.where(nearest.amin(-1) > 0, nearest.amin(-1), nearest.amax(-1))
+
+
+def _last_before(there: Tensor) -> Tensor:
+    """(B, N) the last place up to every place where something is there (B, N); -1: none."""
+    return torch.arange(there.shape[1], device=there.device).expand_as(there).masked_fill(~there, -1).cummax(-1).values

@@ -32,7 +32,14 @@ PARTS: dict[str, tuple[str, ...]] = {  # the modules whose entries each extensio
     "rounds": ("fast/decode.py", "fast/rounds.py"),
     "adjoint": ("adjoint/rounds.py",),
     "pool": ("search/pool.py", "search/background.py", "search/cold.py"),
-    "survey": ("search/surface.py", "search/grid.py", "search/leftover.py", "search/hypotheses.py", "loops/shape.py"),
+    "survey": (
+        "search/surface.py",
+        "search/grid.py",
+        "search/leftover.py",
+        "search/unobserved.py",
+        "search/hypotheses.py",
+        "loops/shape.py",
+    ),
     "choice": ("search/hypothesis_features.py", "search/accept.py", "search/choose.py"),
     "answer": ("loops/candidates.py", "loops/chains.py", "fast/uncertainty.py", "encoder/aligned_loops.py"),
 }

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchcrf_scan.geometry import se2
 from torchcrf_scan.loops.jit import Array, Booleans, entry
-from torchcrf_scan.loops.rigid import apply, compose, inverse, motion_onto, rotate, transform_of, wrap
+from torchcrf_scan.loops.rigid import apply, rotate, transform_of
 from torchcrf_scan.loops.solve import axes_of
 from torchcrf_scan.prediction import LEAST_SHARE
-from torchcrf_scan.search.background import cost_of, polish, refine, unit_length
+from torchcrf_scan.search.background import background_cost, polish, refine, unit_length
 from torchcrf_scan.search.directions import Directions, directions_of
 from torchcrf_scan.search.grid import ScanGrid, grid_of
 
@@ -97,26 +98,31 @@ def settle(
     source, target = straightened(source, seen.surface), straightened(target, there)
     nearer = less_turned(source, target, moved_towards(motion, guess, seen), guess)
     nearer = moved_towards(refine(nearer[None], source, target)[0], guess, seen)
-    is_alike = cost_of(nearer, source, target) <= cost_of(motion, source, target) + ALIKE
-    return source, target, nearer if is_alike else motion
+    return source, target, nearer if is_alike(nearer, motion, source, target, ALIKE) else motion
 
 
 def less_turned(source: ScanGrid, target: ScanGrid, motion: Array, guess: Array) -> Array:
     """(3,) the motion (3,), or if it is far turned against the guess (3,) the registration from there, if that explains alike."""
-    if abs(wrap(motion[0] - guess[0])) < LARGE_TURN:
+    if abs(se2.wrap(motion[0] - guess[0])) < LARGE_TURN:
         return motion
     other = refine(polish(guess[None], source, target, unit_length(source.scan, target.scan)), source, target)[0]
-    return other if cost_of(other, source, target) <= cost_of(motion, source, target) + ALIKE_TURNED else motion
+    return other if is_alike(other, motion, source, target, ALIKE_TURNED) else motion
+
+
+def is_alike(one: Array, other: Array, source: ScanGrid, target: ScanGrid, units: float) -> bool:
+    """Whether a motion (3,) explains the scans as well as another one (3,), but for some units of cost."""
+    cost = background_cost(np.stack([one, other]), source, target, 0, 1.0)
+    return bool(cost[0] <= cost[1] + units)
 
 
 def moved_towards(motion: Array, guess: Array, seen: Observed) -> Array:
     """(3,) the motion, along what is not observed as the guess (3,)."""
-    middle = apply(inverse(motion), seen.centre[None])
-    shift = (apply(guess, middle) - seen.centre)[0]
-    turn, x, y = seen.unobserved @ np.array([wrap(guess[0] - motion[0]) * seen.length, *shift])
-    at_x, at_y = seen.centre
-    step = motion_onto(turn / seen.length, at_x, at_y, at_x + x, at_y + y)
-    return compose(step, motion)
+    middle = se2.apply(se2.inverse(motion), seen.centre[None])
+    shift = (se2.apply(guess, middle) - seen.centre)[0]
+    turn, *shift = seen.unobserved @ np.array([se2.wrap(guess[0] - motion[0]) * seen.length, *shift])
+    theta = turn / seen.length
+    step = np.array([theta, *(seen.centre + shift - se2.rotate(np.array([theta]), seen.centre[None])[0])])
+    return se2.compose(step, motion)
 
 
 def straightened(grid: ScanGrid, surface: Directions) -> ScanGrid:
