@@ -70,9 +70,8 @@ def evaluate(
 ) -> int:
     """Scores predictions of annotated pairs: overview, the paper's Tables I to III, calibration, flow; by sequence and in all.
 
-    The predictions are read from files, or made by a method. With `--frame_offset` or `--frame_turn` the method (joint or
-    start) gets every second scan in another frame, without knowing the displacement; its results are scored in the pair's own
-    frames, and a table shows how often the ego motion is within 20 cm and 0.02 rad all the same.
+    The predictions are read from files, or made by a method. With `--frame_offset` or `--frame_turn` the method (joint or start)
+    gets every second scan in another frame, unknowingly; a table shows how often the ego motion is right all the same.
 
     Args:
         pair_files: pair files with annotation
@@ -88,8 +87,7 @@ def evaluate(
         worst: with --causes, number of pairs with the most wrong points to name
         output: with --causes, folder for its tables (causes.md) and pictures of the worst pairs
         candidates: target points considered for each source point, 0 for all; by default as the model was saved
-        outlier_distance: metres; points farther from every target point, under their own motion, are outliers, and no others; by
-            default as the model was saved
+        outlier_distance: metres; points farther from all target points under their own motion are outliers; default: as saved
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; by default its own choice
     """
@@ -101,19 +99,24 @@ def evaluate(
         make_folder("--json", Path(json).parent)
     pairs = _annotated_pairs(pair_files)
     load = partial(load_model, PRETRAINED if model is None else model, candidates, device, threads, outlier_distance)
+    name = "joint" if method is None else method
     if predictions is not None:
         name, answers = Path(predictions).resolve().name, _read_predictions(list(pairs), Path(predictions))
     else:
-        name = "joint" if method is None else method
         answers = _run(name, load, list(pairs.values()), displacement, seed)
     tables, figures = _score(name, list(pairs.values()), answers, displacement, seed)
     if causes:
         more, counts = explain(load(), list(pairs.values()), worst, output)
         tables, figures = tables + more, figures | counts
-    print("\n".join(table.to_markdown() for table in tables), end="")
-    if json is not None:
-        write_whole(Path(json), json_format.dumps(figures, indent=2) + "\n")
+    _tell(tables, figures, json)
     return 0
+
+
+def _tell(tables: Sequence[Table], figures: dict[str, Any], path: str | None) -> None:
+    """Prints the tables; writes the figures."""
+    print("\n".join(table.to_markdown() for table in tables), end="")
+    if path is not None:
+        write_whole(Path(path), json_format.dumps(figures, indent=2) + "\n")
 
 
 def _score(
