@@ -15,7 +15,8 @@ class StreamConfig:
     Attributes:
         lag: seconds; a scan is matched to the newest one that is at least so much older: in less time nothing moves visibly.
         history: number of scans kept to match to.
-        keyframe_share: a keyframe is replaced when it explains less than this share of a scan's background,
+        keyframe_share: a keyframe is replaced when it explains less than this share of a scan's background (half of it suffices
+            while the sensor stands where it was taken),
         keyframe_distance: or is this many metres away,
         keyframe_turn: or this many radians.
         least_share: of the returns that a motion must explain; otherwise the scan is not placed.

@@ -26,6 +26,7 @@ from torchcrf_scan.stream.view import History, View
 FEWEST_POINTS = 3  # fewer returns do not determine a motion
 LEAST_OF_INTERVAL = 0.1  # that remain between the times of two poses when the middles of their sweeps differ
 DOUBTED = 0.5  # a keyframe that explains less than this share of what the scan before explains is not believed
+SHARE_THERE = 0.5  # of `keyframe_share`, which is enough for a keyframe taken where the sensor still is
 ALIKE = 0.02  # metres or radians; poses this near explain the same
 FASTEST = 100.0  # metres a second, in at least one second, that odometry may go; more is a fault of it
 FARTHEST_GUESS = 1e5  # metres that it may go at all: the model takes guesses within 1e6
@@ -213,7 +214,7 @@ class ScanStream:
         config = self.config
         is_near = np.hypot(x, y) < config.keyframe_distance and abs(theta) < config.keyframe_turn
         is_there = (np.abs(placement.motion) < MOST).all()  # a newer keyframe would see the same, and be less certain
-        return bool(is_near and placement.share >= config.keyframe_share * (DOUBTED if is_there else 1.0))
+        return bool(is_near and placement.share >= config.keyframe_share * (SHARE_THERE if is_there else 1.0))
 
     # --- the answers --------------------------------------------------------------------------------------------------------------
 
