@@ -56,6 +56,25 @@ def test_help_tells_every_option(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (["match", "a.npz", "--outptu", "b"], "(did you mean --output instead of --outptu?)"),
+        (["evaluate", "a.npz", "--metod=icp"], "(did you mean --method instead of --metod?)"),
+        (["experiment", "--confg", "a.yaml"], "(did you mean --config instead of --confg?)"),
+        (["simulate", "--output", "b", "--simulator.beamz", "5"], "--simulator.beams instead of --simulator.beamz"),
+        (["match", "a.npz", "--output", "b", "--xyzzy"], None),
+    ],
+)
+def test_a_mistyped_option_is_told_with_the_right_one(
+    arguments: list[str], hint: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        run(*arguments)
+    said = capsys.readouterr().err
+    assert "did you mean" not in said if hint is None else hint in said
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ([], "command"),

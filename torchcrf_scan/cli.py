@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
-from jsonargparse import ActionYesNo, ArgumentParser
+from jsonargparse import ActionYesNo
 
 from torchcrf_scan import __version__
 from torchcrf_scan.commands.bench import bench
@@ -24,6 +24,7 @@ from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.commands.listen import listen
 from torchcrf_scan.commands.match import match
 from torchcrf_scan.commands.odometry import odometry
+from torchcrf_scan.commands.parser import CommandParser
 from torchcrf_scan.commands.play import play
 from torchcrf_scan.commands.plot import plot
 from torchcrf_scan.commands.prepare import prepare
@@ -101,10 +102,10 @@ def arguments_of(command: Callable[..., int], values: dict[str, Any]) -> dict[st
     return {**values, SHARED: Options(**shared)}
 
 
-def make_parser() -> ArgumentParser:
+def make_parser() -> CommandParser:
     """The parser of all commands."""
     description = "Associations, moving objects and motions between two consecutive planar laser scans."
-    parser = ArgumentParser(prog="torchcrf-scan", description=description, version=__version__)
+    parser = CommandParser(prog="torchcrf-scan", description=description, version=__version__)
     subcommands = parser.add_subcommands(dest="command")
     for name, command in COMMANDS.items():
         summary = (inspect.getdoc(command) or "").split("\n\nArgs:")[0]
@@ -113,13 +114,13 @@ def make_parser() -> ArgumentParser:
     return parser
 
 
-def _command_parser(name: str, command: Callable[..., int], summary: str) -> ArgumentParser:
+def _command_parser(name: str, command: Callable[..., int], summary: str) -> CommandParser:
     """Options from the signature; parameters in `POSITIONAL` become positional arguments, those in `FLAGS` take no value."""
     parameters = inspect.signature(command).parameters
     forms = {key: metavar + (" ..." if count else "") for key, (metavar, count, _) in POSITIONAL.items()}
     forms |= {"output": "--output OUTPUT"}
     shown = [form for key, form in forms.items() if key in parameters and parameters[key].default is inspect.Parameter.empty]
-    parser = ArgumentParser(description=summary, usage=" ".join(["torchcrf-scan", name, *shown, "[options]"]))
+    parser = CommandParser(description=summary, usage=" ".join(["torchcrf-scan", name, *shown, "[options]"]))
     for key, (metavar, count, meaning) in POSITIONAL.items():
         if key in parameters:
             parser.add_argument(key, type=str, metavar=metavar, nargs=count, help=meaning)

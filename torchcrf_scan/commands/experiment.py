@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 from jsonargparse import ArgumentError, ArgumentParser
 
+from torchcrf_scan.commands.parser import CommandParser
 from torchcrf_scan.experiment.parser import config_of, load_yaml, settings_parser
 from torchcrf_scan.experiment.settings import RunConfig
 
@@ -43,7 +44,7 @@ def experiment(*, ablations: str | None = None, **settings: Any) -> int:
 def experiment_parser(summary: str) -> ArgumentParser:
     """Options: every setting, from YAML files and one by one."""
     usage = "torchcrf-scan experiment [--config CONFIG.yaml] [--ablations FOLDER] --output OUTPUT [settings]"
-    parser = settings_parser(description=summary, usage=usage)
+    parser = settings_parser(CommandParser, description=summary, usage=usage)
     parser.add_argument("--ablations", type=str | None, help="folder of YAML files, each a variant: prints one table of them")
     return parser
 

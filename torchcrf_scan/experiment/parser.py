@@ -14,10 +14,10 @@ from torchcrf_scan.experiment.settings import RunConfig
 MOST_VALUES, DEEPEST = 10_000, 50  # limits of a YAML file; ours have some fifty values, four levels deep
 
 
-def settings_parser(**options: Any) -> ArgumentParser:
+def settings_parser(kind: type[ArgumentParser] = ArgumentParser, **options: Any) -> ArgumentParser:
     """A parser of the fields of `RunConfig`, from YAML files (`--config`) and one by one. options: of `ArgumentParser`."""
     _bound_yaml()
-    parser = ArgumentParser(**options)
+    parser = kind(**options)
     parser.add_argument("--config", action="config", help="YAML file of settings")
     parser.add_class_arguments(RunConfig)
     return parser
