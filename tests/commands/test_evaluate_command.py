@@ -259,6 +259,9 @@ def test_evaluate_names_the_bad_argument(
 ) -> None:
     assert "joint, start, static, background, icp, ransac" in fail(capsys, "evaluate", pairs_dir, "--method=magic")
     assert "--predictions" in fail(capsys, "evaluate", pairs_dir, "--predictions", predictions_dir, "--method=joint")
+    for option in ("--candidates=5", "--outlier_distance=1"):
+        assert "expected no --candidates" in fail(capsys, "evaluate", pairs_dir, "--predictions", predictions_dir, option)
+    assert "/nosuch: no such file or folder" in fail(capsys, "evaluate", "/nosuch", "--method=static")
     assert "none for 4 of 4, the first sim_s0_000.npz" in fail(capsys, "evaluate", pairs_dir, "--predictions", tmp_path)
     assert "source_ranges" in fail(capsys, "evaluate", predictions_dir, "--predictions", predictions_dir)
     pair = read_pair(pairs_dir / "sim_s0_000.npz")

@@ -51,6 +51,12 @@ def test_a_file_is_known_by_its_content(tmp_path: Path, content: bytes, name: st
         assert "pickle" not in str(error.value)
 
 
+def test_another_text_is_told_the_formats(tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("# Scans\n\nNo scan in here.\n")
+    with pytest.raises(ValueError, match=r": expected one of pair file, ROS 1 bag, .*, got another text .*FLASER"):
+        list(read_scans(tmp_path / "README.md"))
+
+
 @pytest.mark.parametrize(
     "content",
     [b"", b"#ROSBAG V2", b"\x89MCAP", b"SQLite format", b"P", b"\x1f\x8b\x08\0", gzip.compress(CARMEN.encode(), mtime=0)[:15]],

@@ -152,7 +152,7 @@ def test_no_test_pair_is_no_error() -> None:
     ("arguments", "message"),
     [
         (["--data.simulate_train=[]"], "data.simulate_train: expected a world at least where data.train names no files, got none"),
-        (["--data.train=/nosuch"], "patterns: expected /nosuch to match pair files"),
+        (["--data.train=/nosuch"], "/nosuch: no such file or folder"),
         (["--init=nosuch", "--gradient.objective=unrolled"], "name_or_path: expected a folder with config.json or one of"),
     ],
 )

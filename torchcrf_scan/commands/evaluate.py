@@ -93,6 +93,8 @@ def evaluate(
     """
     if predictions is not None and (method, model) != (None, None):
         raise ValueError("--predictions: expected no --method and no --model beside it, got both")
+    if predictions is not None and (candidates, outlier_distance) != (None, None):
+        raise ValueError("--predictions: expected no --candidates and no --outlier_distance beside it, as nothing is computed")
     displacement = _displacement(frame_offset, frame_turn, predictions)
     check_causes(output, worst, causes, method, (predictions, displacement))
     if json is not None:

@@ -27,6 +27,10 @@ WORDS = {"RLASER": ("rearlaser", "rear_laser")}  # by which PARAM lines name the
 FRONT = ("frontlaser", "front_laser")
 
 
+class NotCarmenError(ValueError):
+    """A text without a single line of a laser."""
+
+
 @dataclass(slots=True)
 class Survey:
     """What is known of a log before it is read.
@@ -110,7 +114,7 @@ def _note(line: Line, seen: _Seen) -> None:
 
 def _choose_kind(path: Path, kinds: Counter[str], topic: str | None) -> str:
     if not kinds:
-        raise ValueError(f"{path}: expected lines that start with {', '.join(PREFERRED)}, got none")
+        raise NotCarmenError(f"{path}: expected lines that start with {', '.join(PREFERRED)}, got none")
     if topic is None:
         return next((kind for kind in PREFERRED if kind in kinds), min(kinds))
     if topic not in kinds:

@@ -62,8 +62,16 @@ def _matches(pattern: str | Path) -> list[Path]:
     found = list(path.glob("*.npz")) if path.is_dir() else [Path(name) for name in glob.glob(str(path), recursive=True)]
     files = [file for file in found if file.is_file()]
     if not files:
-        raise ValueError(f"patterns: expected {pattern} to match pair files (.npz), got none")
+        raise ValueError(_missing(pattern, path))
     return files
+
+
+def _missing(pattern: str | Path, path: Path) -> str:
+    """Why a pattern has no files."""
+    if path.is_dir():
+        return f"{pattern}: expected pair files (.npz) in this folder, got none"
+    is_glob = glob.has_magic(str(pattern))
+    return f"{pattern}: expected a pattern that matches files, got none" if is_glob else f"{pattern}: no such file or folder"
 
 
 def split_by_sequence(pairs: Sequence[ScanPair], held_out: int | float, seed: int = 0) -> tuple[list[ScanPair], list[ScanPair]]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from torchcrf_scan.data import mcap_bag, ros1_bag, ros2_bag
 from torchcrf_scan.data.archive import ZIP
 from torchcrf_scan.data.carmen import read_carmen
+from torchcrf_scan.data.carmen_survey import NotCarmenError
 from torchcrf_scan.data.csv_scans import FIRST, read_csv_scans
 from torchcrf_scan.data.options import AS_RECORDED, AUTO, ReadOptions
 from torchcrf_scan.data.pair_file import read_pair_scans
@@ -60,6 +61,14 @@ def _is_text(head: bytes) -> bool:
     return head.strip() != b"" and head[0] not in BINARY and min(head) >= ord("\t")
 
 
+def _read_text(path: Path, options: ReadOptions) -> Iterator[Reading]:
+    """The scans of a text, which is taken for a CARMEN log; one without any is told the formats that are read."""
+    try:
+        yield from read_carmen(path, options)
+    except NotCarmenError as error:
+        raise ValueError(f"{path}: expected one of {NAMES}, got another text ({error})") from error
+
+
 PAIR = Format("pair file", _begins(ZIP), read_pair_scans, ())
 FOLDER = Format("folder of ROS 2", lambda head: False, read_folder_bag)
 FORMATS = (  # the first that fits
@@ -68,7 +77,7 @@ FORMATS = (  # the first that fits
     Format("MCAP file", _begins(mcap_bag.MAGIC), read_mcap),
     Format("ROS 2 database", _begins(ros2_bag.SQLITE), read_sqlite_bag),
     Format("CSV of ranges", _is_csv, read_csv_scans, ("no_return",)),
-    Format("CARMEN log", _is_text, read_carmen, ("topic", "no_return")),
+    Format("CARMEN log", _is_text, _read_text, ("topic", "no_return")),
     FOLDER,
 )
 NAMES = ", ".join(form.name for form in FORMATS)
