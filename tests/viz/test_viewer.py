@@ -1,5 +1,6 @@
 """Results reach the viewer's file; a viewer that takes nothing holds nobody up."""
 
+import resource
 import socket
 import sys
 import time
@@ -21,6 +22,24 @@ def test_a_file_for_the_viewer_holds_every_result(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.rrd"]
     assert (tmp_path / "a.rrd").stat().st_size > 10_000
     assert (tmp_path / "a.rrd").read_bytes()[:4] in (b"RRF2", b"RRIO")
+
+
+def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path) -> None:
+    """The limit of a file's size stands for the end of the disk."""
+
+    def write() -> None:
+        with viewer.writing_rerun(tmp_path / "a.rrd") as show:
+            for result in true_results(12):
+                show(result)
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_viewer_that_takes_nothing_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ from torchcrf_scan.result import ScanResult
 from torchcrf_scan.scan import BACKGROUND, Bools, Floats
 from torchcrf_scan.viz.frames import MAP, SEEN, UNSURE
 from torchcrf_scan.viz.marks import INK, mover_look
-from torchcrf_scan.whole_file import whole_path
+from torchcrf_scan.whole_file import whole_file
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -44,13 +44,19 @@ def check_viewer(option: str) -> None:
 
 @contextmanager
 def writing_rerun(path: Path) -> Iterator[Show]:
-    """A file for the viewer; there when the block ends, and only if it ends without error."""
-    with whole_path(path) as temporary:
+    """A file for the viewer; there when the block ends, and only if it ends without error. Raises OSError on a full disk."""
+    with whole_file(path) as file:
         stream = _new_stream()
-        stream.save(str(temporary), _blueprint())
-        yield ResultLog(stream).add
-        stream.flush()
-        stream.disconnect()
+        content = stream.binary_stream()  # a file written here: rerun's own writer does not tell of a full disk
+        stream.send_blueprint(_blueprint(), make_active=False)
+        log = ResultLog(stream)
+
+        def show(result: ScanResult) -> None:
+            log.add(result)
+            file.write(content.read() or b"")
+
+        yield show
+        file.write(content.read() or b"")
 
 
 @contextmanager
