@@ -45,9 +45,11 @@ def check_viewer(option: str) -> None:
 @contextmanager
 def writing_rerun(path: Path) -> Iterator[Show]:
     """A file for the viewer; there when the block ends, and only if it ends without error. Raises OSError on a full disk."""
+    from rerun import binary_stream
+
     with whole_file(path) as file:
         stream = _new_stream()
-        content = stream.binary_stream()  # a file written here: rerun's own writer does not tell of a full disk
+        content = binary_stream(stream)  # a file written here: rerun's own writer does not tell of a full disk
         stream.send_blueprint(_blueprint(), make_active=False)
         log = ResultLog(stream)
 
