@@ -16,13 +16,13 @@ from torchcrf_scan.inference import uncertainty
 from torchcrf_scan.inference.directions import surface_tangents
 from torchcrf_scan.inference.motion import Support, hard_support, line_fit
 from torchcrf_scan.inference.uncertainty import (
-    RUN,
+    RIDGE,
     Calibration,
     association_log_odds,
     cluster_log_odds,
+    left_out,
     log_odds,
     motion_covariance,
-    shared_scores,
 )
 from torchcrf_scan.prediction import Prediction, Uncertainty
 
@@ -136,15 +136,34 @@ def test_a_cluster_without_points_has_the_prior() -> None:
     assert found.degenerate[0].sum(-1).tolist() == [0, 3]
 
 
-def test_noise_of_tangents_does_not_hold_a_corridor() -> None:
-    """Neighbours a noise apart make tangents of any direction; taken at their word they would hold the motion along it."""
-    points = torch.cat([line((0, -1), (3, -1), 300), line((3, 1), (0, 1), 300)])
-    noisy = points + NOISE * normal(600, 2, seed=3)
+@pytest.mark.parametrize("n", [300, 1000])
+def test_noise_of_tangents_does_not_hold_a_corridor(n: int) -> None:
+    """Neighbours a noise or less apart make tangents of any direction; taken at their word they would hold the motion along it."""
+    points = torch.cat([line((0, -1), (3, -1), n), line((3, 1), (0, 1), n)])
+    noisy = points + NOISE * normal(2 * n, 2, seed=3)
     tangent = torch.nn.functional.normalize(noisy.roll(-1, 0) - noisy.roll(1, 0), dim=-1)
     assert (tangent[:, 1] ** 2).mean() > 0.2
-    source = points[None] + NOISE * normal(1, 600, 2, seed=4)
+    source = points[None] + NOISE * normal(1, 2 * n, 2, seed=4)
     found = covariance(source, support_of(source, noisy[None], tangent[None]), torch.zeros(1, 1, 3).double())
     assert found.degenerate.tolist() == [[[True, False, False]]]
+
+
+def test_few_points_in_one_place_hold_a_direction_less_than_as_many_in_several() -> None:
+    """A fit follows the errors of those points, whose residuals tell nothing then; it stays without one of several such places."""
+    lengths = []
+    for places in ((0,), (-6, -2, 2, 6)):
+        wall, n = [], 24 // len(places)
+        for x in (*places, 12):
+            wall += [line((x - 3, 1.5), (x, 1.5), 200 // (len(places) + 1)), line((x, 1.5), (x, 1.2), n)] if x < 12 else []
+        source = torch.cat([line((-12, -1.5), (12, -1.5), 200), *wall[::-1]])[None]
+        support = support_of(source, source, torch.zeros_like(source))
+        tangent = torch.where(
+            (source[..., :1].diff(dim=1, append=source[:, -1:, :1]).abs() < 1e-9), torch.eye(2)[1], torch.eye(2)[0]
+        )
+        support = replace(support, tangent=tangent.double())
+        found = covariance(source, support, torch.zeros(1, 1, 3).double())
+        lengths.append(found.covariance[0, 0, 1, 1].sqrt())
+    assert lengths[0] > 3 * lengths[1]
 
 
 # The covariance against draws.
@@ -168,7 +187,7 @@ def draws(points: Tensor, metric: str, times: int = 600) -> tuple[Tensor, Tensor
 
 @pytest.mark.parametrize(
     ("metric", "n", "low", "high"),
-    [("point", 10, 0.8, 1.5), ("point", 150, 1.3, 2.4), ("line", 150, 1.2, 2.6)],  # independent errors count up to twice
+    [("point", 10, 1.5, 4.5), ("point", 150, 1.5, 3.5), ("line", 150, 1.5, 5.5)],  # runs of two walls are few: more than needed
 )
 def test_covariance_against_draws(metric: str, n: int, low: float, high: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """In every direction the variance is that of the draws, far from the origin, where a turn moves t most.
@@ -203,10 +222,22 @@ def test_a_step_not_made_counts() -> None:
     assert_close(covariance(source, support, off, "point").covariance[0, 0, 1, 1].sqrt(), 0.05, tolerance=0.05)
 
 
-def test_shared_scores_by_hand() -> None:
-    score = normal(2, 3, 7, 3)
-    runs = [score[..., max(0, i - RUN + 1) : i + 1, :].sum(-2) for i in range(7 + RUN - 1)]
-    assert_close(shared_scores(score), sum(run[..., :, None] * run[..., None, :] for run in runs) / RUN)
+def test_left_out_by_hand() -> None:
+    """Every run of two neighbours, also the ones that reach beyond the ends, with the fit to all others."""
+    score, weights = normal(2, 3, 7, 3).double(), torch.rand(2, 3, 7).double()
+    rows = normal(2, 3, 7, 2, 3, seed=1).double()
+    each = weights[..., None, None] * rows.mT @ rows
+    whole = each.sum(2) + RIDGE * weights.sum(-1)[..., None, None] * torch.eye(3).double()
+    together = apart = torch.zeros(2, 3, 3, 3).double()
+    for i in range(8):
+        run = slice(max(0, i - 1), i + 1)
+        change = whole @ torch.linalg.inv(whole - each[:, :, run].sum(2))
+        moved = change @ score[:, :, run].sum(2)[..., None]
+        together = together + moved @ moved.mT / 2
+        apart = apart + change @ (weights[..., None, None] * each)[:, :, run].sum(2) @ change.mT / 2
+    found = left_out(score, each, weights, torch.full((2, 3), 2))
+    assert_close(found[0], together)
+    assert_close(found[1], apart)
 
 
 def test_surface_tangents() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchcrf_scan.fast.motion import POINT, Members, members_of, places_of
 from torchcrf_scan.fast.robust import robust_weight
-from torchcrf_scan.inference.uncertainty import BENT, COARSE, EMPTY, MOST_CERTAIN, NOTHING, RUN, SHARED, TINY, WITHIN
+from torchcrf_scan.inference.uncertainty import BENT, COARSE, EMPTY, MOST_CERTAIN, NOTHING, RIDGE, RUNS, SHARED, TINY, WITHIN
 from torchcrf_scan.loops.jit import Array, Integers, entry, kernel
 from torchcrf_scan.loops.rigid import rotate, transform, transform_of
 from torchcrf_scan.loops.solve import axes_of, inverse_of, product
@@ -76,60 +76,26 @@ def linearise(
     return Fit(weights, residual, jacobian, freedom, centre, length)
 
 
-@kernel
-def shared_scores(score: Array, places: Integers) -> Array:
-    """(3, 3) sum of the squared scores of runs of `RUN` points, averaged over all offsets of the runs.
-
-    score: (P, 3) of the points at places (P,), ascending.
-    """
-    P = len(places)
-    together = np.zeros((3, 3))
-    a = b = c = 0.0
-    enters = leaves = 0
-    for last in range(places[0] if P > 0 else 0, (places[P - 1] + RUN) if P > 0 else 0):
-        if enters < P and places[enters] == last:
-            a, b, c = a + score[enters, 0], b + score[enters, 1], c + score[enters, 2]
-            enters += 1
-        if leaves < P and places[leaves] == last - RUN:
-            a, b, c = a - score[leaves, 0], b - score[leaves, 1], c - score[leaves, 2]
-            leaves += 1
-        if enters == leaves:
-            a = b = c = 0.0
-        together[0, 0] += a * a
-        together[0, 1] += a * b
-        together[0, 2] += a * c
-        together[1, 1] += b * b
-        together[1, 2] += b * c
-        together[2, 2] += c * c
-    for r in range(3):
-        for d in range(r, 3):
-            together[r, d] /= RUN
-            together[d, r] = together[r, d]
-    return together
-
-
 class Sums(NamedTuple):
-    """Sums over the P points of a fit, with weights w, residuals r and Jacobians J.
+    """Sums over the first points of a fit, with weights w, residuals r and Jacobians J.
 
     Attributes:
-        score: (P, 3) w J^T r of every point; step: (3,) their sum. normal: (3, 3) w J^T J, apart: (3, 3) w^2 J^T J, both symmetric.
-        total: of the weights. variance: of a residual. spread: mean squared residual.
+        score: (P+1, 3) of w J^T r. normal: (P+1, 3, 3) of H = w J^T J. apart: (P+1, 3, 3) of w H.
+        total: of all weights. spread: mean squared residual.
     """
 
     score: Array
-    step: Array
     normal: Array
     apart: Array
     total: float
-    variance: float
     spread: float
 
 
 @kernel
-def sums_of(fit: Fit, noise: float) -> Sums:
-    """Sums over the points of a fit. noise: standard deviation of a return."""
+def sums_of(fit: Fit) -> Sums:
+    """Sums over the points of a fit."""
     P = len(fit.weights)
-    score, step, apart, normal = np.empty((P, 3)), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+    score, normal, apart = np.zeros((P + 1, 3)), np.zeros((P + 1, 3, 3)), np.zeros((P + 1, 3, 3))
     total = squares = free = 0.0
     for p in range(P):
         w, j = fit.weights[p], fit.jacobian[p]
@@ -138,17 +104,12 @@ def sums_of(fit: Fit, noise: float) -> Sums:
         squares += w * (rx * rx + ry * ry)
         free += w * fit.freedom[p]
         for r in range(3):
-            score[p, r] = w * (j[0, r] * rx + j[1, r] * ry)
-            step[r] += score[p, r]
-            for d in range(r, 3):
+            score[p + 1, r] = score[p, r] + w * (j[0, r] * rx + j[1, r] * ry)
+            for d in range(3):
                 both = w * (j[0, r] * j[0, d] + j[1, r] * j[1, d])
-                normal[r, d] += both
-                apart[r, d] += w * both
-    for r in range(3):
-        for d in range(r):
-            normal[r, d], apart[r, d] = normal[d, r], apart[d, r]
-    spread = squares / max(free, 1e-9)
-    return Sums(score, step, normal, apart, max(total, 1e-9), max(2 * noise**2, spread), spread)
+                normal[p + 1, r, d] = normal[p, r, d] + both
+                apart[p + 1, r, d] = apart[p, r, d] + w * both
+    return Sums(score, normal, apart, max(total, 1e-9), squares / max(free, 1e-9))
 
 
 @kernel
@@ -163,12 +124,41 @@ def shared_error(fit: Fit, places: Integers, spread: float, noise: float, surfac
 
 
 @kernel
-def score_covariance(sums: Sums, places: Integers) -> Array:
-    """(3, 3) covariance of the summed score, the middle of the sandwich estimator. places: (P,) of the points, ascending."""
-    meat = shared_scores(sums.score, places)
+def score_covariance(sums: Sums, places: Integers, noise: float) -> Array:
+    """(3, 3) covariance of the summed score, the middle of the sandwich estimator.
+
+    places: (P,) of the points, ascending. noise: standard deviation of a return.
+    """
+    P = len(places)
+    length = (P + RUNS - 1) // RUNS
+    step, whole, meat = sums.score[P], sums.normal[P].copy(), np.zeros((3, 3))
+    for r in range(3):
+        whole[r, r] += RIDGE * sums.total
+    rest, score = np.empty((3, 3)), np.empty(3)
+    enters = leaves = 0
+    for last in range(places[0] if P > 0 else 0, (places[P - 1] + length) if P > 0 else 0):
+        if enters < P and places[enters] == last:
+            enters += 1
+        if leaves < P and places[leaves] == last - length:
+            leaves += 1
+        if enters == leaves:
+            continue
+        for r in range(3):
+            for d in range(3):
+                rest[r, d] = whole[r, d] - (sums.normal[enters, r, d] - sums.normal[leaves, r, d])
+        change = product(whole, inverse_of(rest))
+        for r in range(3):
+            score[r] = 0.0
+            for d in range(3):
+                score[r] += change[r, d] * (sums.score[enters, d] - sums.score[leaves, d])
+                rest[r, d] = sums.apart[enters, r, d] - sums.apart[leaves, r, d]
+        alone = product(product(change, rest), change.T.copy())
+        for r in range(3):
+            for d in range(3):
+                meat[r, d] += (score[r] * score[d] + noise**2 * alone[r, d]) / length
     for r in range(3):
         for d in range(3):
-            meat[r, d] += sums.variance * (sums.apart[r, d] + (NOTHING if r == d else 0.0)) + sums.step[r] * sums.step[d]
+            meat[r, d] += (NOTHING * max(noise**2, sums.spread) if r == d else 0.0) + step[r] * step[d]
     return meat
 
 
@@ -195,8 +185,8 @@ def cluster_covariance(
         noise: standard deviation of a return. reach: largest distance of a source point from the sensor.
         surface: of all source points.
     """
-    sums = sums_of(fit, noise)
-    normal, total = sums.normal, sums.total
+    sums = sums_of(fit)
+    normal, total = sums.normal[len(places)].copy(), sums.total
     for r in range(3):
         for d in range(3):
             normal[r, d] /= total
@@ -206,7 +196,7 @@ def cluster_covariance(
             normal[r, r] -= LEAST_SHARE
     keep = projection_on(information, directions)
     bread = product(product(keep, normal), keep)
-    known = product(product(bread, inverse_of(score_covariance(sums, places))), bread)
+    known = product(product(bread, inverse_of(score_covariance(sums, places, noise))), bread)
     for r in range(3):
         for d in range(3):
             known[r, d] *= total * total

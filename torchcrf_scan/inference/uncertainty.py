@@ -1,9 +1,11 @@
 """Uncertainty of predictions: covariances of the motions, unobserved directions, and calibrated confidences.
 
 A motion's errors come from more than the sensor's noise: returns sample a surface, surfaces bend, neighbouring beams share a jolt,
-and the fit stops early. So the covariance uses the larger of residuals and sensor noise, and is that of a sum of correlated
-scores (a sandwich estimator). Noise in the directions of surfaces must not count as information: along a corridor every noisy
-tangent seems to constrain the motion. Tangents are therefore estimated anew, from stretches long compared with the noise.
+and the fit stops early. So the covariance uses residuals and sensor noise, and is that of a sum of correlated scores (a sandwich
+estimator). Where a few points alone hold a direction the fit follows their errors and leaves no residual: every run of points is
+judged by the fit without it, a jackknife (CR3 of Cameron and Miller, "A practitioner's guide to cluster-robust inference", 2015).
+Noise in the directions of surfaces must not count as information: along a corridor every noisy tangent seems to constrain the
+motion. Tangents are therefore estimated anew, from stretches long compared with the noise.
 
 Scans that are skewed, by turning while they are swept, fit none the better for more points: what noise and sampling do not explain
 of the residuals tells how much, and is an error of the motion as a whole.
@@ -24,7 +26,8 @@ from torchcrf_scan.inference.directions import is_straight, spacing_of, surface_
 from torchcrf_scan.inference.motion import Support
 from torchcrf_scan.prediction import LEAST_SHARE, Uncertainty
 
-RUN = 48  # neighbouring points with possibly correlated errors: a jolt lasts several degrees
+RUNS = 6  # a cluster consists of so many runs of neighbouring points whose errors may be correlated
+RIDGE = 0.01  # of all information: what a motion is known without a run that alone holds one of its directions
 NOTHING = 1e-3  # of a point's information, so that no matrix is singular
 TINY = 1e-6  # of the scene's extent: the least noise
 EMPTY = 1000.0  # noises: the extent of a scene without points, some ten metres
@@ -40,15 +43,17 @@ def motion_covariance(
 ) -> Uncertainty:
     """Covariance of the motions fitted by `motion.estimate`, and their unobserved directions.
 
-    With the score g_i = w_i J_i^T M_i r_i of every point and H = sum_i w_i J_i^T M_i J_i, it is H^-1 K H^-1 where K sums
+    With the score g_i = w_i J_i^T M_i r_i of every point, H_i = w_i J_i^T M_i J_i and H their sum, it is H^-1 K H^-1 where K sums
 
-        v sum_i w_i^2 J_i^T M_i J_i                          independent errors, v the larger of two returns' noise and residuals
-        1 / RUN sum over runs of points of (sum g) (sum g)^T     errors shared by neighbours
-        (sum_i g_i) (sum_i g_i)^T                            the remaining step: the fit stopped before convergence.
+        1 / R sum over runs of A (sum g) (sum g)^T A^T     errors shared by neighbours; a run has R points, one in `RUNS`
+        1 / R sum over runs of A v (sum w H) A^T           independent errors, v the squared noise of a return
+        (sum_i g_i) (sum_i g_i)^T                          the remaining step: the fit stopped before convergence.
 
-    To it comes the error that all points share (`shared_error`), alike in all directions. Independent errors are counted up to
-    twice, and errors hidden by the choice of partners are not counted: `Calibration.covariance_factor` corrects for both. A
-    direction with less information than `LEAST_SHARE` has only a prior: no point moves farther than the scene's extent, and a
+    A = H (H - sum H)^-1 turns the score of a run under this fit into that under the fit to all others (`left_out`).
+
+    To it comes the error that all points share (`shared_error`), alike in all directions. Independent errors are counted one and
+    a half times, and more where few runs hold a direction; errors hidden by the choice of partners are not counted:
+    `Calibration.covariance_factor` corrects for both. A direction with less information than `LEAST_SHARE` has only a prior: no point moves farther than the scene's extent, and a
     rotation is arbitrary. Differentiable at a fixed set of these directions. O(B C N).
 
     Args:
@@ -62,16 +67,18 @@ def motion_covariance(
     noise = noise.maximum(TINY * reach)
     at = Linearisation.of(source, support, motions, metric, scale, noise)
     total = at.weights.sum(-1).clamp(min=1e-9)  # (B, C)
-    score = (at.jacobian * (at.weights[..., None] * at.residual)[..., None]).sum(-2)  # (B, C, N, 3)
-    step = score.sum(-2)
+    score = (at.jacobian * (at.weights[..., None] * at.residual)[..., None]).sum(-2).double()  # (B, C, N, 3)
+    each = torch.einsum("bcn,bcnia,bcnid->bcnad", at.weights, at.jacobian, at.jacobian).double()  # (B, C, N, 3, 3)
+    step, normal = score.sum(-2), each.sum(-3)
     spread = (at.weights * (at.residual**2).sum(-1)).sum(-1) / (at.weights * at.freedom).sum(-1).clamp(min=1e-9)
-    variance = torch.maximum(2 * noise[:, None] ** 2, spread)[..., None, None].double()  # (B, C, 1, 1)
-    apart = torch.einsum("bcn,bcnia,bcnid->bcad", at.weights**2, at.jacobian, at.jacobian).double()
-    together = shared_scores(score) + step[..., :, None] * step[..., None, :]
     identity = torch.eye(3, dtype=torch.float64, device=source.device)
-    meat = variance * (apart + NOTHING * identity) + together
+    variance = (noise.double() ** 2)[:, None]  # (B, 1) of a return
+    length = ((support.weights > 0).sum(-1) + RUNS - 1) // RUNS  # (B, C) points in a run
+    together, apart = left_out(score, each, at.weights.double(), length)
+    nothing = NOTHING * torch.maximum(variance, spread.double())[..., None, None] * identity
+    meat = together + variance[..., None, None] * apart + nothing + step[..., :, None] * step[..., None, :]
 
-    normal = torch.einsum("bcn,bcnia,bcnid->bcad", at.weights, at.jacobian, at.jacobian).double() / total[..., None, None]
+    normal = normal / total[..., None, None]
     information, vectors = torch.linalg.eigh(normal.detach())
     seen = vectors * (information >= LEAST_SHARE)[..., None, :]
     keep = seen @ vectors.mT  # projection onto the observed directions
@@ -79,12 +86,12 @@ def motion_covariance(
         LEAST_SHARE if MOTION_METRICS[metric].along_surface else 0.0
     )  # by the residual noise of the tangents, and by steps along the surface
     bread = keep @ (normal - pretended * identity) @ keep * total[..., None, None]
-    length = at.length.double()
-    prior = torch.stack([3 / (torch.pi * length) ** 2, *(1 / reach[:, None] ** 2).expand(2, *length.shape)], -1).diag_embed()
+    extent = at.length.double()
+    prior = torch.stack([3 / (torch.pi * extent) ** 2, *(1 / reach[:, None] ** 2).expand(2, *extent.shape)], -1).diag_embed()
     local = torch.linalg.inv(bread @ torch.linalg.inv(meat) @ bread + prior)
     if MOTION_METRICS[metric].along_surface:
         local = local + shared_error(source, at, spread, noise)[..., None, None].double() * identity
-    covariance = about_origin(local, length, (motions[..., 1:] - at.centre).double())
+    covariance = about_origin(local, extent, (motions[..., 1:] - at.centre).double())
     return Uncertainty(covariance.to(source), information.to(source), vectors.mT.to(source))
 
 
@@ -170,15 +177,31 @@ def about_origin(local: Tensor, length: Tensor, offset: Tensor) -> Tensor:
     return (covariance + covariance.mT) / 2
 
 
-def shared_scores(score: Tensor) -> Tensor:
-    """(B, C, 3, 3) sum of the squared scores of runs of `RUN` points, averaged over all offsets of the runs.
+def left_out(score: Tensor, each: Tensor, weights: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    """Sums over runs, averaged over all offsets: of squared scores, and of independent errors of unit variance; (B, C, 3, 3).
 
-    Padding and points of other clusters contribute 0. score: (B, C, N, 3), in beam order.
+    Both are those of the fit without the run (`motion_covariance`), which knows `RIDGE` of all information of directions that the
+    run alone holds. Padding and points of other clusters contribute 0. O(B C N).
+
+    Args:
+        score: (B, C, N, 3), in beam order. each: (B, C, N, 3, 3) H_i. weights: (B, C, N). length: (B, C) points in a run.
     """
-    flat = score.flatten(0, 1).mT  # (B C, 3, N)
-    padded = nn.functional.pad(flat, (RUN - 1, RUN - 1))
-    runs = RUN * nn.functional.avg_pool1d(padded, RUN, stride=1)  # (B C, 3, N + RUN - 1)
-    return (runs @ runs.mT / RUN).unflatten(0, score.shape[:2])
+    N = score.shape[2]
+    last = torch.arange(N + (N + RUNS - 1) // RUNS, device=score.device) + 1  # as many as a run of all points needs
+    ends = last.clamp(max=N).expand(*length.shape, -1), (last - length[..., None]).clamp(0, N)  # (B, C, W)
+
+    def run(values: Tensor) -> Tensor:
+        total = nn.functional.pad(values.flatten(3).cumsum(2), (0, 0, 1, 0))  # (B, C, N+1, D)
+        high, low = (total.gather(2, end[..., None].expand(*end.shape, total.shape[-1])) for end in ends)
+        return (high - low).unflatten(3, values.shape[3:])
+
+    ridge = RIDGE * weights.sum(-1).clamp(min=1e-9)[..., None, None] * torch.eye(3, dtype=each.dtype, device=each.device)
+    whole = (each.sum(2) + ridge)[:, :, None]
+    change = whole @ torch.linalg.inv(whole - run(each))  # (B, C, W, 3, 3)
+    scores = (change @ run(score)[..., None]).squeeze(-1)
+    apart = change @ run(weights[..., None, None] * each) @ change.mT
+    share = 1 / length.clamp(min=1)[..., None, None]
+    return share * (scores.mT @ scores), share * apart.sum(2)
 
 
 class Answers(Protocol):
