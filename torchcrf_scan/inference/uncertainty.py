@@ -53,8 +53,9 @@ def motion_covariance(
 
     To it comes the error that all points share (`shared_error`), alike in all directions. Independent errors are counted one and
     a half times, and more where few runs hold a direction; errors hidden by the choice of partners are not counted:
-    `Calibration.covariance_factor` corrects for both. A direction with less information than `LEAST_SHARE` has only a prior: no point moves farther than the scene's extent, and a
-    rotation is arbitrary. Differentiable at a fixed set of these directions. O(B C N).
+    `Calibration.covariance_factor` corrects for both. A direction with less information than `LEAST_SHARE` has only a prior: no
+    point moves farther than the scene's extent, and a rotation is arbitrary. Differentiable at a fixed set of these directions.
+    O(B C N).
 
     Args:
         source: (B, N, 2) in beam order, N >= 1. support: of the last fit. motions: (B, C, 3) its result.
