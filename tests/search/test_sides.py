@@ -73,6 +73,21 @@ def test_what_hangs_together_with_moving_ends_moves_with_them(length: float, y: 
     assert_close(answer.motions, [[0, 0, 0], [0, TRAVEL, 0]], tolerance=0.15)
 
 
+def test_both_engines_move_it_alike() -> None:
+    before, after, on = passes(6, 1.2, 3.0)
+    scans = [Scan.from_ranges(r, BEARINGS, range_max=40.0) for r in (before, after)]
+    one, other = (JointScanCRF.from_pretrained(backend=backend).match(*scans, dt=0.1) for backend in ("auto", "eager"))
+    assert (one.cluster[on] == 1).mean() > 0.9
+    assert (one.cluster == other.cluster).all()
+    assert_close(one.motions, other.motions, tolerance=1e-3)
+
+
+def test_an_end_that_stands_still_holds_its_side() -> None:
+    """It has grown longer, which nothing rigid does."""
+    before, after = (ranges_of([vehicle(0.5 * extra, 1.5, 3.0 + extra)], k) for k, extra in enumerate((0.0, 1.0)))
+    assert len(slides(before, after).motions) == 0
+
+
 def test_nothing_slides_where_nothing_moves() -> None:
     before, after, _ = passes(6, 1.2, 0.0, travel=0.0)
     assert len(slides(before, after).motions) == 0
