@@ -14,6 +14,7 @@ from torchcrf_scan.search.hypotheses import Hypotheses, members_of
 from torchcrf_scan.search.hypothesis_features import hypothesis_features
 from torchcrf_scan.search.leftover import leftover_of
 from torchcrf_scan.search.score import HypothesisScore
+from torchcrf_scan.search.sides import sliding_sides
 from torchcrf_scan.search.surface import surface_of
 from torchcrf_scan.search.survey import Survey, survey_at
 
@@ -84,7 +85,7 @@ def hypotheses_of(motions: Array, members: Booleans) -> Hypotheses:
 def survey_of(source: ScanGrid, target: ScanGrid, background: Array, motions: Array, members: Booleans) -> Survey:
     """What a background (3,) leaves, and these hypotheses with their features."""
     leftover, hypotheses = leftover_of(source, target, background), hypotheses_of(motions, members)
-    return Survey(leftover, hypotheses, hypothesis_features(leftover, hypotheses))
+    return Survey(leftover, hypotheses, hypothesis_features(leftover, hypotheses), sliding_sides(leftover))
 
 
 def accepted_of(survey: Survey, score: HypothesisScore | None = None) -> Integers:

@@ -24,6 +24,7 @@ from torchcrf_scan.scan import ScanPair
 from torchcrf_scan.search.grid import ScanGrid, grid_of
 from torchcrf_scan.search.hypotheses import Hypotheses, members_of
 from torchcrf_scan.search.leftover import Leftover
+from torchcrf_scan.search.sides import Sides
 from torchcrf_scan.search.surface import Surface, surface_of
 from torchcrf_scan.search.survey import grids_of, survey_at
 
@@ -85,6 +86,7 @@ class Surveyed:
     leftover: Leftover
     found: Hypotheses
     features: Array
+    sides: Sides
 
     @property
     def source(self) -> Surface:

@@ -183,7 +183,7 @@ def test_padding_is_no_point(pairs: list[ScanPair], found: Start) -> None:
     assert found.reach is not None
     assert (found.association[~batch.source_mask] == -1).all()
     assert (found.target_tangents[~batch.target_mask] == 0).all()
-    assert (found.reach[..., 0] == 0).all()
+    assert (found.reach[~batch.source_mask][:, 0] == 0).all()
     assert (found.reach[~batch.source_mask][:, 1:] == FARTHEST).all()
 
 

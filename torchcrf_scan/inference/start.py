@@ -37,7 +37,8 @@ class Start:
         association: (B, N) nearest target point under the best motion, -1 if none is within the gate.
         target_tangents: (B, M, 2) direction of the target's surface at every point, 0 where undefined.
         reach: (B, N, C) distance of every point from the segment by which a mover was found, see `beyond_reach`: 0 where the point
-            may well belong to it, up to `FARTHEST`. Used as `FeatureConfig.reach` says. None: 0 everywhere.
+            may well belong to it, up to `FARTHEST`; of the background 0, but for points of a side that slides. Used as
+            `FeatureConfig.reach` says. None: 0 everywhere.
         log_odds: (B, C) score of every mover, including those that the score alone would reject (and that are not `active`);
             -inf for empty slots, inf for the background. None: `active` is final.
     """

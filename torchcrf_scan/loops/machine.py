@@ -36,6 +36,7 @@ PARTS: dict[str, tuple[str, ...]] = {  # the modules whose entries each extensio
         "search/surface.py",
         "search/grid.py",
         "search/leftover.py",
+        "search/sides.py",
         "search/unobserved.py",
         "search/hypotheses.py",
         "loops/shape.py",

@@ -97,7 +97,7 @@ def start_from(pair: Pair, seen: Survey | None, score: Score, clusters: int) -> 
     if seen is None:
         seen = survey_at(*grids_of(pair), pair.initial_motion, pair.dt)
     unit = resolution(pair.source, pair.target, pair.noise)
-    return choose_movers(seen.leftover, pair.initial_motion, seen.hypotheses, seen.features, score, clusters, unit)
+    return choose_movers(*seen, pair.initial_motion, score, clusters, unit)
 
 
 def nothing_found(pair: Pair, clusters: int) -> PairStart:

@@ -13,15 +13,22 @@ from torchcrf_scan.search.grid import ScanGrid, grid_of
 from torchcrf_scan.search.hypotheses import Hypotheses, hypothesise
 from torchcrf_scan.search.hypothesis_features import hypothesis_features
 from torchcrf_scan.search.leftover import Leftover, leftover_of
+from torchcrf_scan.search.sides import Sides, sliding_sides
 from torchcrf_scan.search.surface import surface_of
 
 
 class Survey(NamedTuple):
-    """The background's motion with the points it leaves unexplained, H hypothesised motions of movers and their features (H, F)."""
+    """What is found of a pair before the score.
+
+    Attributes:
+        leftover: of the background's motion. hypotheses: H motions of movers. features: (H, F) of these.
+        sides: that slide along themselves.
+    """
 
     leftover: Leftover
     hypotheses: Hypotheses
     features: Array
+    sides: Sides
 
 
 def grids_of(pair: Pair) -> tuple[ScanGrid, ScanGrid]:
@@ -40,4 +47,4 @@ def survey_at(source: ScanGrid, target: ScanGrid, background: Array, dt: float, 
     hypotheses = hypothesise(leftover, dt)
     if expected is not None and len(expected.motions) > 0:
         hypotheses = with_expected(hypotheses, expected, leftover)
-    return Survey(leftover, hypotheses, hypothesis_features(leftover, hypotheses))
+    return Survey(leftover, hypotheses, hypothesis_features(leftover, hypotheses), sliding_sides(leftover))

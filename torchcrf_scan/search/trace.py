@@ -7,8 +7,8 @@ import numpy as np
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
 from torchcrf_scan.loops.jit import Booleans
 from torchcrf_scan.loops.pair import Pair
-from torchcrf_scan.search.accept import Score, probabilities_of, select
-from torchcrf_scan.search.choose import CONSIDERED
+from torchcrf_scan.search.accept import Score, select
+from torchcrf_scan.search.choose import CONSIDERED, judge
 from torchcrf_scan.search.hypotheses import members_of
 from torchcrf_scan.search.survey import Survey
 
@@ -20,8 +20,8 @@ def trace_of(pair: Pair, seen: Survey | None, score: Score, active: Booleans) ->
         nothing = np.zeros((0, N), np.bool_)
         empty = none.astype(np.bool_)
         return SearchTrace(pair.initial_motion, np.zeros((0, 3)), nothing, empty, none, empty, np.full(N, np.inf))
-    leftover, hypotheses = seen.leftover, seen.hypotheses
-    probabilities = probabilities_of(score, seen.features)
+    leftover = seen.leftover
+    hypotheses, probabilities = judge(seen.hypotheses, seen.features, seen.sides, score)
     considered = select(leftover, hypotheses, probabilities, CONSIDERED, len(active) - 1)  # as `choose_movers` did
     members = members_of(hypotheses, np.arange(len(probabilities)), N)
     kept = active[1 : 1 + len(considered)]
