@@ -6,7 +6,7 @@ from surveyed import SCENES, survey
 
 from torchcrf_scan.search.feature_points import AT
 from torchcrf_scan.search.score import FEATURES
-from torchcrf_scan.search.survey import grids_of, may_stand, survey_at
+from torchcrf_scan.search.survey import grids_of, may_stand, survey_at, without_standing
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -55,5 +55,14 @@ def test_a_group_may_stand_if_its_new_place_holds_nothing_new(
     assert may_stand(row).tolist() == [is_static]
 
 
-def test_no_hypothesis_of_a_survey_may_stand() -> None:
-    assert not any(may_stand(survey(name).features).any() for name in SCENES)
+def test_what_may_stand_is_left_out_and_nothing_else() -> None:
+    parts = survey("street")
+    whole = survey_at(*grids_of(parts.pair), parts.background, parts.pair.dt)
+    some = whole._replace(features=whole.features.copy())
+    some.features[::2, AT.occluded_before], some.features[::2, AT.landing_open] = 1.0, 0.0
+    left = without_standing(some)
+    assert 0 < len(left.features) < len(some.features)
+    assert not may_stand(left.features).any()
+    moves = ~may_stand(some.features)
+    assert left.hypotheses.motions.tolist() == some.hypotheses.motions[moves].tolist()
+    assert left.hypotheses.group.tolist() == some.hypotheses.group[moves].tolist()

@@ -45,10 +45,14 @@ def survey_at(source: ScanGrid, target: ScanGrid, background: Array, dt: float, 
     hypotheses = hypothesise(leftover, dt)
     if expected is not None and len(expected.motions) > 0:
         hypotheses = with_expected(hypotheses, expected, leftover)
-    features = hypothesis_features(leftover, hypotheses)
-    moves = ~may_stand(features)
+    return Survey(leftover, hypotheses, hypothesis_features(leftover, hypotheses))
+
+
+def without_standing(seen: Survey) -> Survey:
+    """The survey without the hypotheses whose groups may as well stand."""
+    moves, hypotheses = ~may_stand(seen.features), seen.hypotheses
     hypotheses = hypotheses._replace(motions=hypotheses.motions[moves], group=hypotheses.group[moves])
-    return Survey(leftover, hypotheses, features[moves])
+    return seen._replace(hypotheses=hypotheses, features=seen.features[moves])
 
 
 def may_stand(features: Array) -> Booleans:
