@@ -69,7 +69,10 @@ def choose(batch: ScanPairBatch, surveys: Sequence[Survey | None], score: Score,
 
 
 def survey_pair(pair: Pair, share: Share = alone, expected: Expected | None = None) -> Survey | None:
-    """Surfaces, background and hypotheses of what cannot stand; None if a scan has fewer than three points. share: see `background_pool`."""
+    """Surfaces, background and hypotheses of what cannot stand; None if a scan has fewer than three points.
+
+    share: see `background_pool`.
+    """
     if pair.fewest_points < FEWEST_POINTS:
         return None
     return without_standing(survey_at(*find_start(pair, share), pair.dt, expected))
