@@ -63,6 +63,22 @@ def test_a_motion_that_explains_far_less_than_standing_still_is_not_believed() -
     assert choose_background(np.array([0.001, 0.0, 0.0]), np.zeros(3), source, target).is_found
 
 
+def test_a_plain_room_is_not_believed_to_be_turned_round() -> None:
+    pair = simulate_pairs(every(NAMED_WORLDS["passed_512"], 0.3), 42, 21, 4)[40]
+    start = start_of(ScanPairBatch.collate([pair]))
+    assert recovered(start.motions[:, 0], np.zeros((1, 3))) == 1
+
+
+def test_of_motions_that_explain_a_plain_room_alike_the_one_near_the_guess_is_believed() -> None:
+    angles = np.radians(np.arange(-180.0, 180.0))
+    room = np.minimum(4 / np.maximum(np.abs(np.cos(angles)), 1e-9), 3 / np.maximum(np.abs(np.sin(angles)), 1e-9))
+    scan = Scan.from_ranges(room, angles)
+    source, target = grids_of(pair_of(ScanPairBatch.collate([ScanPair(scan, scan, 0.1)]), 0))
+    turned = np.array([0.999 * np.pi, 0.0, 0.0])
+    assert np.abs(choose_background(turned, np.zeros(3), source, target).motion).max() < 0.01
+    assert choose_background(turned, turned, source, target).is_found
+
+
 def seen_from_afar(pair: ScanPair) -> ScanPair:
     """The second scan as a sensor elsewhere would number and measure the same points."""
     points = se2.apply(OFFSET, pair.target.points)

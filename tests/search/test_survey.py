@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from surveyed import SCENES, survey
 
+from torchcrf_scan.search.feature_points import AT
 from torchcrf_scan.search.score import FEATURES
-from torchcrf_scan.search.survey import grids_of, survey_at
+from torchcrf_scan.search.survey import grids_of, may_stand, survey_at, without_standing
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -33,3 +34,35 @@ def test_a_survey_is_the_same_every_time() -> None:
     again = survey_at(*grids_of(at.pair), at.background, at.pair.dt)
     assert again.features.tolist() == at.features.tolist()
     assert again.hypotheses.motions.tolist() == at.found.motions.tolist()
+
+
+@pytest.mark.parametrize(
+    ("occluded", "seen_through", "landing_open", "units", "is_static"),
+    [
+        (1.0, 0.0, 0.0, 5.0, True),  # the edge of a shadow that runs along a wall
+        (1.0, 0.0, 1.0, 5.0, False),  # somebody comes nearer: what is found there is new
+        (0.0, 0.2, 0.0, 1.5, True),  # the end of a wall, seen at another beam
+        (0.0, 0.9, 0.0, 1.5, False),  # gone from where the second scan sees through
+        (0.0, 0.2, 0.0, 5.0, False),  # a car slides along its side
+    ],
+)
+def test_a_group_may_stand_if_its_new_place_holds_nothing_new(
+    occluded: float, seen_through: float, landing_open: float, units: float, is_static: bool
+) -> None:
+    row = np.zeros((1, len(FEATURES)))
+    row[0, AT.occluded_before], row[0, AT.seen_through_before] = occluded, seen_through
+    row[0, AT.landing_open], row[0, AT.displacement] = landing_open, np.log1p(units)
+    assert may_stand(row).tolist() == [is_static]
+
+
+def test_what_may_stand_is_left_out_and_nothing_else() -> None:
+    parts = survey("street")
+    whole = survey_at(*grids_of(parts.pair), parts.background, parts.pair.dt)
+    some = whole._replace(features=whole.features.copy())
+    some.features[::2, AT.occluded_before], some.features[::2, AT.landing_open] = 1.0, 0.0
+    left = without_standing(some)
+    assert 0 < len(left.features) < len(some.features)
+    assert not may_stand(left.features).any()
+    moves = ~may_stand(some.features)
+    assert left.hypotheses.motions.tolist() == some.hypotheses.motions[moves].tolist()
+    assert left.hypotheses.group.tolist() == some.hypotheses.group[moves].tolist()

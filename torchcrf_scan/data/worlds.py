@@ -93,6 +93,7 @@ WORLDS = {
 AS_RECORDED = SimulatorConfig(range_noise=0.008, states_limits=False, matches_mixed=True, least_travel=1.0, movers_max=3)
 STREET = replace(AS_RECORDED, ego_translation=3.0, vibration=0.03, litter=0.5)
 INDOOR = replace(AS_RECORDED, scene="indoor", range_max=30.0, dt=0.3, ego_translation=0.4, litter=2.0, vibration=0.015)
+ROOM = replace(INDOOR, fov=360.0, dt=0.2, ego_translation=0.1)  # people and robots before walls, a few metres away
 STANDING = replace(INDOOR, ego_translation=0.0, ego_rotation=0.0)
 SMALL = replace(AS_RECORDED, scale=0.1, range_max=9.0, dropout=0.3, dt=0.4, ego_translation=4.0, ego_rotation=0.25, aperture=0.2)
 CARS = replace(SMALL, beams=360, fov=360.0, range_noise=0.005, vibration=0.012, sweep=0.08)
@@ -117,6 +118,7 @@ TRAINING_WORLDS = {  # named by scene and beams
     "indoor_512": replace(INDOOR, beams=512, fov=240.0, range_max=10.0, vibration=0.005, sweep=0.07, movers_max=5),
     "indoor_1081": replace(INDOOR, beams=1081, fov=270.0, vibration=0.005, sweep=0.019, movers_max=5),
     "crowd_768": replace(INDOOR, beams=768, fov=270.0, movers_min=2, movers_max=6, vibration=0.005, ego_translation=0.1),
+    "room_720": replace(ROOM, beams=720, range_max=10.0, range_noise=0.01, sweep=0.1, movers_min=1, movers_max=4),
     "passed_512": replace(STANDING, beams=512, fov=240.0, range_max=8.0, dropout=0.5, passer=1.0),
     "cars_360": CARS,
     "cars_240": replace(CARS, beams=240, fov=240.0, range_noise=0.01, sweep=0.1),

@@ -26,7 +26,7 @@ from torchcrf_scan.search.choose import FEWEST_POINTS, choose_movers
 from torchcrf_scan.search.expected import Expected
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.pool import Share, alone, find_background
-from torchcrf_scan.search.survey import Survey, grids_of, survey_at
+from torchcrf_scan.search.survey import Survey, grids_of, survey_at, without_standing
 from torchcrf_scan.search.trusted import choose_background
 from torchcrf_scan.search.unobserved import less_turned, settle
 
@@ -69,10 +69,13 @@ def choose(batch: ScanPairBatch, surveys: Sequence[Survey | None], score: Score,
 
 
 def survey_pair(pair: Pair, share: Share = alone, expected: Expected | None = None) -> Survey | None:
-    """Surfaces, background and hypotheses; None if a scan has fewer than three points. share: see `background_pool`."""
+    """Surfaces, background and hypotheses of what cannot stand; None if a scan has fewer than three points.
+
+    share: see `background_pool`.
+    """
     if pair.fewest_points < FEWEST_POINTS:
         return None
-    return survey_at(*find_start(pair, share), pair.dt, expected)
+    return without_standing(survey_at(*find_start(pair, share), pair.dt, expected))
 
 
 def find_start(pair: Pair, share: Share) -> tuple[ScanGrid, ScanGrid, Array]:

@@ -6,15 +6,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.loops.jit import Array
+from torchcrf_scan.loops.jit import Array, Booleans
 from torchcrf_scan.loops.pair import Pair
 from torchcrf_scan.search.expected import Expected, with_expected
+from torchcrf_scan.search.feature_points import AT
 from torchcrf_scan.search.grid import ScanGrid, grid_of
 from torchcrf_scan.search.hypotheses import Hypotheses, hypothesise
 from torchcrf_scan.search.hypothesis_features import hypothesis_features
 from torchcrf_scan.search.leftover import Leftover, leftover_of
 from torchcrf_scan.search.sides import Sides, sliding_sides
 from torchcrf_scan.search.surface import surface_of
+
+NEW = 0.3  # share of a group's new places that what stands leaves unexplained, below which it may stand, if that share
+HIDDEN = 0.5  # or more of it is hidden from the second scan where it stood,
+A_LITTLE, CONTRADICTED = 2.7, 0.7  # or it moved by fewer units, and the second scan sees through less of it
 
 
 class Survey(NamedTuple):
@@ -48,3 +53,20 @@ def survey_at(source: ScanGrid, target: ScanGrid, background: Array, dt: float, 
     if expected is not None and len(expected.motions) > 0:
         hypotheses = with_expected(hypotheses, expected, leftover)
     return Survey(leftover, hypotheses, hypothesis_features(leftover, hypotheses), sliding_sides(leftover))
+
+
+def without_standing(seen: Survey) -> Survey:
+    """The survey without the hypotheses whose groups may as well stand."""
+    moves, hypotheses = ~may_stand(seen.features), seen.hypotheses
+    hypotheses = hypotheses._replace(motions=hypotheses.motions[moves], group=hypotheses.group[moves])
+    return seen._replace(hypotheses=hypotheses, features=seen.features[moves])
+
+
+def may_stand(features: Array) -> Booleans:
+    """(H,) whether a group may as well stand: whatever is found at its new place was there before. features: (H, F).
+
+    The edge of a shadow runs along a wall like a mover, and the end of a wall is seen at another beam.
+    """
+    is_hidden = features[:, AT.occluded_before] >= HIDDEN
+    is_near = (features[:, AT.displacement] < np.log1p(A_LITTLE)) & (features[:, AT.seen_through_before] < CONTRADICTED)
+    return (features[:, AT.landing_open] < NEW) & (is_hidden | is_near)

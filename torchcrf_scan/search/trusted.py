@@ -6,13 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Bools, Floats
 from torchcrf_scan.search.background import refine
 from torchcrf_scan.search.grid import ScanGrid
 from torchcrf_scan.search.leftover import leftover_of
+from torchcrf_scan.search.unobserved import LARGE_TURN
 
 TIGHT = 1.0  # units of `leftover_of`: a return this near to a surface is explained by it
-LEAST_OF_BEST = 0.6  # of the returns that the best candidate explains
+LEAST_OF_BEST = 0.6  # of the returns that the best candidate explains,
+LEAST_TURNED = 1.02  # and if far turned against the guess: a plain room explains as many turned round
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,14 +34,15 @@ class Backed:
 
 
 def choose_background(found: Floats, guess: Floats, grid: ScanGrid, reference: ScanGrid) -> Backed:
-    """The motion found (3,), unless the guess (3,) or standing still explain far more returns."""
+    """The motion found (3,), unless the guess (3,) or standing still explain far more returns; any more, if it is far turned."""
     first = _backed(found, grid, reference, True)
-    if first.share >= LEAST_OF_BEST:  # no candidate explains more than all
+    least = LEAST_OF_BEST if abs(se2.wrap(found[0] - guess[0])) < LARGE_TURN else LEAST_TURNED
+    if first.share >= least:  # whatever the other candidates explain
         return first
     starts = np.stack([guess, np.zeros(3)])
     others = [_backed(motion, grid, reference, False) for motion in (*starts, *refine(starts, grid, reference))]
     best = max(others, key=lambda backed: backed.share)
-    return first if first.share >= LEAST_OF_BEST * best.share else best
+    return first if first.share >= least * best.share else best
 
 
 def _backed(motion: Floats, grid: ScanGrid, reference: ScanGrid, is_found: bool) -> Backed:
