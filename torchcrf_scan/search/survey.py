@@ -17,9 +17,8 @@ from torchcrf_scan.search.leftover import Leftover, leftover_of
 from torchcrf_scan.search.sides import Sides, sliding_sides
 from torchcrf_scan.search.surface import surface_of
 
-NEW = 0.3  # share of a group's new places that what stands leaves unexplained, below which it may stand, if that share
-HIDDEN = 0.5  # or more of it is hidden from the second scan where it stood,
-A_LITTLE, CONTRADICTED = 2.7, 0.7  # or it moved by fewer units, and the second scan sees through less of it
+NEW = 0.3  # share of a group's new places that what stands leaves unexplained, below which it may stand if
+HIDDEN = 0.5  # this share or more of it is hidden from the second scan where it stood
 
 
 class Survey(NamedTuple):
@@ -65,8 +64,6 @@ def without_standing(seen: Survey) -> Survey:
 def may_stand(features: Array) -> Booleans:
     """(H,) whether a group may as well stand: whatever is found at its new place was there before. features: (H, F).
 
-    The edge of a shadow runs along a wall like a mover, and the end of a wall is seen at another beam.
+    The edge of a shadow runs along a wall like a mover.
     """
-    is_hidden = features[:, AT.occluded_before] >= HIDDEN
-    is_near = (features[:, AT.displacement] < np.log1p(A_LITTLE)) & (features[:, AT.seen_through_before] < CONTRADICTED)
-    return (features[:, AT.landing_open] < NEW) & (is_hidden | is_near)
+    return (features[:, AT.landing_open] < NEW) & (features[:, AT.occluded_before] >= HIDDEN)
