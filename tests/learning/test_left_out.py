@@ -9,13 +9,16 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.baselines.icp import GATES, choose_gate
+from torchcrf_scan.config import InferenceConfig
 from torchcrf_scan.experiment import models as of_experiment
 from torchcrf_scan.experiment.cross_validation import make_folds
 from torchcrf_scan.experiment.models import Models, fit_models
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
+from torchcrf_scan.features.potentials import Boosters, PairView
+from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.pseudo_likelihood import Chain
+from torchcrf_scan.inference.pseudo_likelihood import Chain, PlugIns
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.learning import cascade_fit
 from torchcrf_scan.learning import fit as of_fit
@@ -25,6 +28,7 @@ from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.names import ASSOCIATION_NODE
 from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.variants.lattice_likelihood import LatticeChain
 
 PROTOCOLS = ("leave_one_pair_out", "leave_one_sequence_out")
 
@@ -196,3 +200,19 @@ def test_crf_clustering_is_fed_by_boosters_without_the_fold(
     monkeypatch.setattr(cascade_fit.Cascade, "feed", lambda self, *given: fed.append(self.matching) or real(self, *given))
     fit_cascade(material, small_config)
     assert [model.boosters is kept[0][1][part.fold] for model, part in zip(fed, material, strict=True)] == [True] * len(material)
+
+
+def test_a_lattice_learns_from_boosters_without_the_fold(
+    material: list[Material], small_config: RunConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: list[object] = []
+    real = of_fit.ONE_CHAINS["lattice"]
+
+    def watched(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, inference: InferenceConfig) -> LatticeChain:
+        used.append(boosters)
+        return real(view, plugins, scales, boosters, inference)
+
+    monkeypatch.setattr(of_fit, "ONE_CHAINS", {"lattice": watched})
+    model = JointScanCRF(replace(small_config.model, coupling="lattice"))
+    margins = fit(model, material, replace(small_config.learning, max_steps=2))
+    assert [boosters is margins[part.fold] for boosters, part in zip(used, material, strict=True)] == [True] * len(material)

@@ -14,8 +14,10 @@ from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.experiment.models import JOINT, features_key, fit_models
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
+from torchcrf_scan.features.potentials import Boosters
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.learning import own_start, trainer
 from torchcrf_scan.learning.fit import Margins, fit
 from torchcrf_scan.learning.material import Material, collect
@@ -92,17 +94,17 @@ def test_the_search_is_what_it_was(material: list[Material]) -> None:
 
 
 def test_every_fold_is_started_by_boosters_without_it(material: list[Material], monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Margins] = []
-    real = own_start.start_anew
+    used: list[Boosters] = []
 
-    def watch(model: JointScanCRF, parts: list[Material], margins: Margins) -> list[Material]:
-        seen.append(margins)
-        return real(model, parts, margins)
+    def begin(view: object, found: Start, parameters: Parameters, inference: object) -> Start:
+        used.append(parameters.boosters)
+        return found
 
-    monkeypatch.setattr(own_start, "start_anew", watch)
+    monkeypatch.setattr(own_start, "BEGINNINGS", {"paper": begin})
     own_starts(JointScanCRF(PAPER), material, LEARNING)
-    assert sorted(seen[0]) == sorted({part.fold for part in material})
-    assert not torch.equal(seen[0][0].data.table, seen[0][1].data.table)
+    tables = {part.fold: boosters.data.table for part, boosters in zip(material, used, strict=True)}
+    assert len(tables) == 2
+    assert not torch.equal(tables[0], tables[1])  # those of the model would be the same
 
 
 def test_an_experiments_and_a_runs_models_are_trained_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
