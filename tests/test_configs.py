@@ -47,18 +47,66 @@ def test_without_a_file_everything_is_the_default() -> None:
     assert parse() == RunConfig()
 
 
+PAPERS_FEATURES = FeatureConfig(
+    free_space=False,
+    decisions=False,
+    reach="off",
+    left_out=(),
+    length_unit="metre",
+    wrap_closed=False,
+    raw_channels=True,
+    stumps=50,
+)
+PAPERS_MOTIONS = {"clusters": 5, "motion_metric": "point", "motion_weights": "hard", "movers": "threshold"}
+
+
+def has_papers_weights(config: RunConfig) -> bool:
+    live = torch.cat(live_weights(config.model.features))
+    return len(list(JointScanCRF(config.model).parameters())) == 30 and bool(live[PAPER_WEIGHTS].all())
+
+
 def test_the_paper_is_the_paper() -> None:
+    """Field by field; every one in which it is not is in the file's comment."""
     config = load("paper.yaml")
+    assert (config.data.pairs, config.data.sequences, config.experiment) == (31, 8, ExperimentConfig())
+    assert has_papers_weights(config)
+    inference = InferenceConfig(**PAPERS_MOTIONS, iterations=50, candidates=8, schedule="sweep")
+    assert config.model == ModelConfig(start="search", features=PAPERS_FEATURES, inference=inference)
+    assert config.learning == LearningConfig(
+        objective="pseudo_likelihood",
+        predicted_share=0.0,
+        folds=4,
+        negatives=10,
+        booster_examples=5000,
+        rotation_noise=0.005,
+        translation_noise=0.02,
+        disturbance=0.0,
+        start_share=0.5,
+    )
+    said = (CONFIGS / "paper.yaml").read_text().split("data:")[0]
+    for departure in ("8 candidates", "sweep", "5,000 examples", "half of the pairs", "out-of-fold", "search", "W-A"):
+        assert departure in said, departure
+
+
+def test_the_exact_paper_has_no_departure() -> None:
+    config = load("paper_exact.yaml")
     assert (config.data.pairs, config.data.sequences) == (31, 8)
-    assert config.model.inference.clusters == 5
-    assert config.model.inference.motion_weights == "hard"
-    assert config.model.inference.motion_metric == "point"
-    assert config.model.start == "search"  # the paper does not say; `paper` is one reading of it
-    assert not config.model.features.wrap_closed
-    assert config.model.features.stumps == 50
-    assert config.learning.negatives == 10
-    assert len(list(JointScanCRF(config.model).parameters())) == 30
-    assert bool(torch.cat(live_weights(config.model.features))[PAPER_WEIGHTS].all())  # and none of them is left out
+    assert has_papers_weights(config)
+    inference = InferenceConfig(**PAPERS_MOTIONS, iterations=10, candidates=0, schedule="flooding", flooding_order="ascending")
+    assert config.model == ModelConfig(start="paper", features=PAPERS_FEATURES, inference=inference)
+    assert config.learning == LearningConfig(
+        objective="pseudo_likelihood",
+        predicted_share=0.0,
+        folds=0,
+        negatives=10,
+        booster_examples=0,
+        batch_size=1,
+        rotation_noise=0.0,
+        translation_noise=0.0,
+        disturbance=0.0,
+        start_share=0.0,
+    )
+    assert config.experiment == ExperimentConfig(protocols=("leave_one_pair_out",), test_every=16, joint_alone=True)
 
 
 def test_the_literal_reading_changes_one_feature() -> None:

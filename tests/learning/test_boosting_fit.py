@@ -91,6 +91,21 @@ def test_wrong_targets_are_never_the_true_one_or_its_neighbour(count: int) -> No
     assert usable.float().mean() > 0.6
 
 
+def test_wrong_targets_of_an_inlier_are_anywhere_near_in_space_and_near_in_index() -> None:
+    """Five, three and two of ten (spec 2.2)."""
+    N, M = 400, 60
+    moved, target = make_points(N)[None], make_points(M, 9)[None]
+    truth = torch.randint(12, M - 12, (1, N), generator=generator(1))
+    index, _ = sample_targets(truth, moved, target, torch.ones(1, M, dtype=torch.bool), 10, generator(0))
+    nearest = torch.cdist(moved[0], target[0]).argsort(-1)[:, :15]
+    is_near = (index[0, :, :, None] == nearest[:, None]).any(-1)
+    assert is_near[:, 5:8].all()
+    assert is_near[:, :5].float().mean() < 0.4  # a quarter of the targets is near
+    apart = (index - truth[..., None]).abs()[0, :, 8:]
+    assert ((apart >= 2) & (apart <= 10)).all()
+    assert torch.bincount(index[..., :5].flatten(), minlength=M).min() > 10
+
+
 def test_wrong_targets_of_an_outlier_are_anywhere_and_the_nearest() -> None:
     N, M, count = 400, 60, 10
     moved, target = make_points(N)[None], make_points(M, 9)[None]

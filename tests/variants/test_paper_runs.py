@@ -101,6 +101,6 @@ def test_the_papers_start_needs_no_more_than_a_model() -> None:
     start = model.initialise(plain_batch(source, target))
     assert start.motions.shape == (1, 4, 3)
     turn, shift = se2.distance(start.motions[0, 0], torch.zeros(3).double())
-    assert float(turn) < 0.02
-    assert float(shift) < 0.1
+    assert float(turn) < 0.05
+    assert float(shift) < 0.2
     assert start.motions.isfinite().all()

@@ -23,6 +23,7 @@ from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.losses import LOSSES
 from torchcrf_scan.learning.material import Material
+from torchcrf_scan.learning.own_start import own_starts
 from torchcrf_scan.learning.ranks import ALONE
 from torchcrf_scan.learning.selection_fit import fit_potential
 from torchcrf_scan.learning.settings import LearningConfig
@@ -57,6 +58,7 @@ def fit_models(study: Study, train: Sequence[int], config: RunConfig, variants: 
     joint = JointScanCRF(replace(config.model, encoder=EncoderConfig()))
     joint.hypothesis_score = score
     key = features_key(study, train, config)
+    material = own_starts(joint, material, config.learning)
     margins = fit(joint, material, config.learning, features_of=study.features_of(key))
     models = {JOINT: joint}
     if config.model.encoder.width > 0:
@@ -112,4 +114,4 @@ def features_key(study: Study, train: Sequence[int], config: RunConfig) -> str:
     features.pop("raw_channels")
     features.pop("reach")
     states = [inference[name] for name in ("clusters", "candidates", "candidate_search")]
-    return json.dumps([study.collection.names, list(train), learning, features, states])
+    return json.dumps([study.collection.names, list(train), config.model.start, learning, features, states])

@@ -67,15 +67,15 @@ def fit(
     if one_chain := ONE_CHAINS.get(model.config.coupling):
         fit_one_chain(model, one_chain, lessons, margins, config, watch.get(model.config.coupling))
         return margins
-    live = live_weights(model.config.features)
     predicted = [lesson.start.association for lesson in lessons]
     if has_association:
-        features = (association_chain(model, lesson, margins[lesson.fold]) for lesson in lessons)
-        set_weights(model, "association", fit_chain(features, live[0], config, watch.get("association")))
+        fit_association(model, lessons, margins, config, watch.get("association"))
         predicted = [predict_association(model, lesson, margins[lesson.fold]) for lesson in lessons]
     if has_clusters:
         features = (clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True))
-        set_weights(model, "clustering", fit_chain(features, live[1], config, watch.get("clustering")))
+        set_weights(
+            model, "clustering", fit_chain(features, live_weights(model.config.features)[1], config, watch.get("clustering"))
+        )
     if has_association and has_clusters:
         model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
     return margins
@@ -97,6 +97,14 @@ def fit_features(
     fitted = fit_scales([lesson.view for lesson in lessons], [lesson.plugins for lesson in lessons])
     model.scales.load_state_dict(fitted.state_dict())
     return fit_all_boosters(model, lessons, config, generator) if model.config.has_association else {}
+
+
+def fit_association(
+    model: JointScanCRF, lessons: Sequence[Lesson], margins: Margins, config: LearningConfig, watch: Watch | None
+) -> None:
+    """Fits the weights of the association chain, with out-of-fold margins."""
+    features = (association_chain(model, lesson, margins[lesson.fold]) for lesson in lessons)
+    set_weights(model, "association", fit_chain(features, live_weights(model.config.features)[0], config, watch))
 
 
 def fit_one_chain(

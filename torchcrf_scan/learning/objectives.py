@@ -20,7 +20,7 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.search.accept import score_of
 from torchcrf_scan.search.pairs import choose
 from torchcrf_scan.variants.lattice_likelihood import LatticeChain
-from torchcrf_scan.variants.register import ONE_CHAINS
+from torchcrf_scan.variants.register import BEGINNINGS, ONE_CHAINS
 
 Objective = Callable[[JointScanCRF, Portion], dict[str, Tensor]]
 
@@ -85,8 +85,8 @@ def labelled_chains(
 
 
 def start_of(model: JointScanCRF, portion: Portion) -> Start:
-    """The initial motions, from the surveys if there are any, else from InitialiseRT."""
-    if not portion.surveys:
+    """The initial motions, from the surveys if there are any and the model starts by the search, else from InitialiseRT."""
+    if not portion.surveys or model.config.start in BEGINNINGS:
         return model.initialise(portion.batch)
     return choose(portion.batch, portion.surveys, score_of(model.hypothesis_score), model.config.motions)
 

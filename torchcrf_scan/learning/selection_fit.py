@@ -24,12 +24,12 @@ def fit_potential(model: JointScanCRF, material: Sequence[Material]) -> ClusterP
     """The potential that best separates true from false movers among those considered in the material.
 
     Returns:
-        The fitted potential; the default one unless the material holds both true and false movers.
+        The fitted potential; the default one unless the material holds both true and false movers, scored by the search.
     """
     from sklearn.linear_model import LogisticRegression
 
     potential = ClusterPotential()
-    parts = [judge_clusters(model, part) for part in material]
+    parts = [judge_clusters(model, part) for part in material if part.start.log_odds is not None]
     terms, label = (torch.cat([part[k] for part in parts]) if parts else torch.zeros(0, 2)[:, 0] for k in range(2))
     if not (bool((label == 1).any()) and bool((label == 0).any())):
         return potential

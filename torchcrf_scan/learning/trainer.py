@@ -35,6 +35,7 @@ from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.learning.monitor import TrainingMonitor
+from torchcrf_scan.learning.own_start import own_starts, start_anew
 from torchcrf_scan.learning.ranks import ALONE, Ranks, join
 from torchcrf_scan.learning.run_log import RunLog
 from torchcrf_scan.learning.selection_fit import fit_potential
@@ -154,8 +155,10 @@ def prepare(
         model.hypothesis_score = collection.fit_score(everything)
     clusters = config.model.inference.clusters - 1
     material = collection.material(everything, model.hypothesis_score, clusters, config.learning)
-    if state is None and not config.init:
-        fit(model, material, config.staged, watches(run, "joint"))
+    if state is not None or config.init:
+        return start_anew(model, material, {})
+    material = own_starts(model, material, config.staged)
+    fit(model, material, config.staged, watches(run, "joint"))
     return material
 
 

@@ -3,6 +3,7 @@
 Slow and faithful. Visits run x_c_1..x_c_N, x_a_1..x_a_N, ascending or in alternating direction (A-20); each visit rebuilds the
 node's local features from the present motions and plug-ins, sends its messages, updates its label and the running sums of
 its clusters. The association candidates are chosen anew before every iteration and messages carried over by target point.
+Labels taken during the visits serve ComputeRT alone; those of the answer are Eq. 3's, from all messages (lines 16 to 21).
 """
 
 from __future__ import annotations
@@ -52,6 +53,25 @@ class Messages:
         """Initial messages, all 0."""
         return cls(like.new_zeros(B, N, S), like.new_zeros(B, N, S))
 
+    def copy(self) -> Messages:
+        """The same messages, unchanged by later ones."""
+        return Messages(self.forward.clone(), self.backward.clone())
+
+    def keep(self, before: Messages, settled: Tensor) -> None:
+        """Takes back the messages sent since `before` in the pairs that have converged (B,)."""
+        self.forward = torch.where(settled[:, None, None], before.forward, self.forward)
+        self.backward = torch.where(settled[:, None, None], before.backward, self.backward)
+
+    def agree_with(self, before: Messages) -> Tensor:
+        """(B,) whether no message has changed by more than the tolerance (spec 7.6)."""
+        both = ((self.forward, before.forward), (self.backward, before.backward))
+        steady = [((new == old) | ((new - old).abs() < MESSAGE_TOLERANCE)).flatten(1).all(-1) for new, old in both]
+        return torch.stack(steady).all(0)
+
+    def joined(self, unary: Tensor) -> Tensor:
+        """(B, N, S) beliefs of all nodes (Eq. 3): local potential and all incoming messages."""
+        return unary + self.forward + self.backward
+
 
 @torch.no_grad()
 def decode(view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> Prediction:
@@ -59,16 +79,20 @@ def decode(view: PairView, start: Start, parameters: Parameters, model: ModelCon
     run = Flooding(view, start, parameters, model)
     converged = torch.zeros(len(view.batch), dtype=torch.bool, device=view.batch.source.device)
     iterations = torch.zeros(len(view.batch), dtype=torch.int64, device=view.batch.source.device)
+    stop_early = model.inference.stop_early
     for iteration in range(model.inference.iterations):
-        before, said = run.state, run.said()
+        before, sent = run.state, [messages.copy() for messages in run.messages]
         run.iterate(descending=model.inference.flooding_order == "alternate" and iteration % 2 == 1)
-        stop_early = model.inference.stop_early
         if stop_early:
             run.state = joint.keep_settled(run.state, before, converged)
+            for messages, old in zip(run.messages, sent, strict=True):
+                messages.keep(old, converged)
         iterations = iterations + (~converged | (not stop_early)).long()
-        converged = converged | (joint.has_settled(run.state, before, model.inference) & run.agrees_with(said))
+        agree = [messages.agree_with(old) for messages, old in zip(run.messages, sent, strict=True)]
+        converged = converged | (joint.has_settled(run.state, before, model.inference) & torch.stack(agree).all(0))
         if stop_early and bool(converged.all()):
             break
+    run.take_labels()
     merged = joint.merge_alike(view, run.state, parameters.scales.cluster_distance)
     return joint.read_out(view.batch, start, merged, parameters, model.inference, converged, iterations)
 
@@ -103,32 +127,36 @@ class Flooding:
                 self.visit_association(i)
         self._retire_empty()
 
-    def said(self) -> list[Tensor]:
-        """Copies of all messages."""
-        both = (self.cluster_messages, self.association_messages)
-        return [message.clone() for messages in both for message in (messages.forward, messages.backward)]
+    @property
+    def messages(self) -> tuple[Messages, Messages]:
+        """Messages of both chains."""
+        return self.cluster_messages, self.association_messages
 
-    def agrees_with(self, before: list[Tensor]) -> Tensor:
-        """(B,) whether no message has changed by more than the tolerance (spec 7.6)."""
-        steady = [
-            ((new == old) | ((new - old).abs() < MESSAGE_TOLERANCE)).flatten(1).all(-1)
-            for new, old in zip(self.said(), before, strict=True)
-        ]
-        return torch.stack(steady).all(0)
+    def take_labels(self) -> None:
+        """Labels every node by its belief (lines 16 to 21): features anew at the last motions, all messages, argmax (Eq. 3).
+
+        The last visit has computed the motions already (line 16).
+        """
+        mask, everything = self.view.batch.source_mask, slice(0, self.view.batch.source.shape[1])
+        found = find_candidates(self.view, self.state.motions.value, self.state.motions.active, self.config)
+        if self.model.has_clusters:
+            belief = self.cluster_messages.joined(self._cluster_potentials(everything, found)[0])
+            labels = joint.cluster_labels(belief.argmax(-1), belief.shape[-1] - 1, mask)
+            self.state = replace(self.state, log_cluster=self._normalised(belief), cluster=labels)
+        if self.model.has_association:
+            self._take_candidates(found)
+            belief = self.association_messages.joined(self._association_unary(everything))
+            labels = joint.association_labels(belief.argmax(-1), found.index, mask)
+            self.state = replace(self.state, log_association=self._normalised(belief), association=labels)
+            if not self.model.has_clusters:
+                self.state = joint.inliers_are_background(self.state)
 
     def visit_cluster(self, i: int, found: Candidates) -> None:
         """Visits one node of the clustering chain: local features, messages to both neighbours, label, motions."""
-        batch, state, scales = self.view.batch, self.state, self.parameters.scales
+        batch, state = self.view.batch, self.state
         here = slice(i, i + 1)
         around = slice(max(i - 1, 0), min(i + 2, batch.source.shape[1]))
-        at = clustering.correspond(
-            batch.source[:, around], batch.target, state.motions.value, found.nearest[:, around], state.association[:, around]
-        )
-        reach = None if self.start.reach is None else self.start.reach[:, around]
-        local = clustering_unary(self.view, at, state.motions.value, state.motions.active, scales, reach)
-        pairwise = clustering.pairwise_features(batch.source[:, around], at, scales)
-        possible = possible_clusters(state.motions.active, self.view.within(reach), around.stop - around.start)
-        unary, edges = clustering_potentials(local, pairwise, possible, self.parameters.clustering)
+        unary, edges = self._cluster_potentials(around, found)
         k = i - around.start
         before = edges[:, k - 1] if k > 0 else None
         after = edges[:, k] if k < edges.shape[1] else None
@@ -141,25 +169,39 @@ class Flooding:
 
     def visit_association(self, i: int) -> None:
         """Visits one node of the association chain, likewise."""
-        batch, state, scales, boosters = self.view.batch, self.state, self.parameters.scales, self.parameters.boosters
+        batch, state = self.view.batch, self.state
         here = slice(i, i + 1)
-        motions, active = state.motions.value, state.motions.active
-        moved = registered_points(batch.source[:, here], motions, active, state.log_cluster[:, here])
-        states = self.states.nodes(here)
-        features = association_unary(self.view, states, moved, scales, boosters)
-        unary = features @ self.parameters.association[:ASSOCIATION_UNARY]
-        unary = unary.masked_fill(~state_mask(states.mask), -torch.inf)[:, 0]
+        candidates, unary = self.states.nodes(here).candidates, self._association_unary(here)[:, 0]
         before = self.edges[:, i - 1] if i > 0 else None
         after = self.edges[:, i] if i < self.edges.shape[1] else None
         belief = self._send(self.association_messages, i, unary, before, after)
         log_association = state.log_association.clone()
         log_association[:, here] = self._normalised(belief)[:, None]
         association = state.association.clone()
-        association[:, here] = joint.association_labels(belief[:, None].argmax(-1), states.candidates, batch.source_mask[:, here])
+        association[:, here] = joint.association_labels(belief[:, None].argmax(-1), candidates, batch.source_mask[:, here])
         state = replace(state, log_association=log_association, association=association)
         if not self.model.has_clusters:
             state = joint.inliers_are_background(state)
         self._relabel(i, state)
+
+    def _cluster_potentials(self, nodes: slice, found: Candidates) -> tuple[Tensor, Tensor]:
+        """Log potentials of some nodes of the clustering chain and of the edges between them, at the present motions."""
+        batch, state, scales = self.view.batch, self.state, self.parameters.scales
+        source, motions, active = batch.source[:, nodes], state.motions.value, state.motions.active
+        at = clustering.correspond(source, batch.target, motions, found.nearest[:, nodes], state.association[:, nodes])
+        reach = None if self.start.reach is None else self.start.reach[:, nodes]
+        local = clustering_unary(self.view, at, motions, active, scales, reach)
+        possible = possible_clusters(active, self.view.within(reach), source.shape[1])
+        return clustering_potentials(local, clustering.pairwise_features(source, at, scales), possible, self.parameters.clustering)
+
+    def _association_unary(self, nodes: slice) -> Tensor:
+        """Log potentials of some nodes of the association chain, at the present motions and clusters."""
+        state, scales, boosters = self.state, self.parameters.scales, self.parameters.boosters
+        source, motions = self.view.batch.source[:, nodes], state.motions
+        moved = registered_points(source, motions.value, motions.active, state.log_cluster[:, nodes])
+        states = self.states.nodes(nodes)
+        features = association_unary(self.view, states, moved, scales, boosters)
+        return (features @ self.parameters.association[:ASSOCIATION_UNARY]).masked_fill(~state_mask(states.mask), -torch.inf)
 
     def _send(self, messages: Messages, i: int, unary: Tensor, before: Tensor | None, after: Tensor | None) -> Tensor:
         """Sends node i's messages to its neighbours; padding sends none. Returns its belief (B, S)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import torch
@@ -17,6 +18,7 @@ from torchcrf_scan.inference import joint
 from torchcrf_scan.inference.start import Start, beyond_reach
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.loops.pair import array_of
+from torchcrf_scan.names import ASSOCIATION_NODE, SHAPE, SHAPE_CHANNELS
 from torchcrf_scan.search.cold import ransac_motions
 
 INDEX_GAP = 3
@@ -42,7 +44,8 @@ def paper_start(view: PairView, found: Start, parameters: Parameters, config: In
 def match_cold(view: PairView, found: Start, parameters: Parameters, config: InferenceConfig) -> tuple[Tensor, Tensor]:
     """Step 1 of spec 7.3: the association chain from standstill (or odometry), and the motion that most associations support.
 
-    No motion is known at first, so the candidates are the most similar in shape (design finding 5).
+    By shape alone: position channels would pull the background to standstill, and movers to the background (design finding 2). No
+    motion is known at first, so the candidates are the most similar in shape too (finding 5).
 
     Returns:
         (B, 3) motion of the background and (B, N) associations.
@@ -51,11 +54,22 @@ def match_cold(view: PairView, found: Start, parameters: Parameters, config: Inf
     nothing = torch.full_like(found.association, -1)
     start = Start(batch.initial_motion[:, None], found.active[:, :1], nothing, found.target_tangents)
     search = replace(config, candidate_search="shape", candidates=config.candidates and max(config.candidates, COLD_CANDIDATES))
+    shapes = by_shape_alone(parameters)
     for _ in range(ROUNDS):
-        association = joint.associate(view, start, torch.zeros_like(nothing), parameters, search)
+        association = joint.associate(view, start, torch.zeros_like(nothing), shapes, search)
         start = replace(start, motions=agreed_motion(batch, start.motions, association))
         search = config
     return start.motions[:, 0], association
+
+
+def by_shape_alone(parameters: Parameters) -> Parameters:
+    """The parameters without the association chain's terms that depend on positions: of L1..L12 and of their boosted score only
+    the share of L1..L9 is left, of the outlier state its constants; the terms of edges stay.
+    """
+    weights, boosters = parameters.association.clone(), copy.deepcopy(parameters.boosters)
+    weights[[k for k, name in enumerate(ASSOCIATION_NODE) if name not in (*SHAPE, "data_boosting")]] = 0.0
+    boosters.data.table[SHAPE_CHANNELS:] = 0.0
+    return replace(parameters, association=weights, boosters=boosters)
 
 
 def agreed_motion(batch: ScanPairBatch, before: Tensor, association: Tensor) -> Tensor:
