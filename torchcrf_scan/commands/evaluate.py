@@ -91,10 +91,7 @@ def evaluate(
         device: device that torch computes on, e.g. cpu or cuda
         threads: number of threads that torch computes with; by default its own choice
     """
-    if predictions is not None and (method, model) != (None, None):
-        raise ValueError("--predictions: expected no --method and no --model beside it, got both")
-    if predictions is not None and (candidates, outlier_distance) != (None, None):
-        raise ValueError("--predictions: expected no --candidates and no --outlier_distance beside it, as nothing is computed")
+    _check_read(predictions, (method, model), (candidates, outlier_distance))
     displacement = _displacement(frame_offset, frame_turn, predictions)
     check_causes(output, worst, causes, method, (predictions, displacement))
     if json is not None:
@@ -136,6 +133,14 @@ def _score(
         tables.append(_displaced_table(displacement, rows_of(name, scores)))
         figures |= _displaced_figures(displacement, seed, scores)
     return tables, figures
+
+
+def _check_read(predictions: str | None, method: tuple[str | None, ...], settings: tuple[float | None, ...]) -> None:
+    """Refuses what has no meaning for predictions that are read. method: also the model. settings: of the model."""
+    if predictions is not None and any(given is not None for given in method):
+        raise ValueError("--predictions: expected no --method and no --model beside it, got both")
+    if predictions is not None and any(given is not None for given in settings):
+        raise ValueError("--predictions: expected no --candidates and no --outlier_distance beside it, as nothing is computed")
 
 
 def _displacement(metres: float | None, turn: Turn | None, predictions: str | None) -> FrameOffset | None:
