@@ -57,6 +57,7 @@ PAPERS_FEATURES = FeatureConfig(
     raw_channels=True,
     stumps=50,
 )
+PAPERS_LEARNING = LearningConfig(objective="pseudo_likelihood", predicted_share=0.0, negatives=10, disturbance=0.0)
 PAPERS_MOTIONS = {"clusters": 5, "motion_metric": "point", "motion_weights": "hard", "movers": "threshold"}
 
 
@@ -72,17 +73,8 @@ def test_the_paper_is_the_paper() -> None:
     assert has_papers_weights(config)
     inference = InferenceConfig(**PAPERS_MOTIONS, iterations=50, candidates=8, schedule="sweep")
     assert config.model == ModelConfig(start="search", features=PAPERS_FEATURES, inference=inference)
-    assert config.learning == LearningConfig(
-        objective="pseudo_likelihood",
-        predicted_share=0.0,
-        folds=4,
-        negatives=10,
-        booster_examples=5000,
-        rotation_noise=0.005,
-        translation_noise=0.02,
-        disturbance=0.0,
-        start_share=0.5,
-    )
+    noise = {"rotation_noise": 0.005, "translation_noise": 0.02, "start_share": 0.5}
+    assert config.learning == replace(PAPERS_LEARNING, folds=4, booster_examples=5000, **noise)
     said = (CONFIGS / "paper.yaml").read_text().split("data:")[0]
     for departure in ("8 candidates", "sweep", "5,000 examples", "half of the pairs", "out-of-fold", "search", "W-A"):
         assert departure in said, departure
@@ -94,18 +86,8 @@ def test_the_exact_paper_has_no_departure() -> None:
     assert has_papers_weights(config)
     inference = InferenceConfig(**PAPERS_MOTIONS, iterations=10, candidates=0, schedule="flooding", flooding_order="ascending")
     assert config.model == ModelConfig(start="paper", features=PAPERS_FEATURES, inference=inference)
-    assert config.learning == LearningConfig(
-        objective="pseudo_likelihood",
-        predicted_share=0.0,
-        folds=0,
-        negatives=10,
-        booster_examples=0,
-        batch_size=1,
-        rotation_noise=0.0,
-        translation_noise=0.0,
-        disturbance=0.0,
-        start_share=0.0,
-    )
+    noise = {"rotation_noise": 0.0, "translation_noise": 0.0, "start_share": 0.0}
+    assert config.learning == replace(PAPERS_LEARNING, folds=0, booster_examples=0, batch_size=1, **noise)
     assert config.experiment == ExperimentConfig(protocols=("leave_one_pair_out",), test_every=16, joint_alone=True)
 
 
