@@ -96,11 +96,11 @@ def test_movers_from_associations() -> None:
 def test_the_papers_start_needs_no_more_than_a_model() -> None:
     source = torch.cat([row(20), row(8, 30.0)])[None] + 0.001 * normal(1, 28, 2)
     target = source.clone()
-    target[0, 20:] += torch.tensor([0.0, 0.8]).double()
+    target[0, 20:] += torch.tensor([2.5, 0.0]).double()  # farther than one motion may be from both
     model = JointScanCRF(ModelConfig(start="paper", inference=InferenceConfig(clusters=5, candidates=0))).double()
     start = model.initialise(plain_batch(source, target))
     assert start.motions.shape == (1, 4, 3)
     turn, shift = se2.distance(start.motions[0, 0], torch.zeros(3).double())
-    assert float(turn) < 0.05
-    assert float(shift) < 0.2
+    assert float(turn) < 0.02
+    assert float(shift) < 0.1
     assert start.motions.isfinite().all()
