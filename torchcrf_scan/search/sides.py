@@ -222,9 +222,10 @@ def _cost(leftover: Leftover, side: Match, motion: Array, contradicted: int) -> 
 
 @kernel
 def _explained(scan: Unexplained, first: int, last: int, motion: Array, other: Unexplained) -> tuple[Array, int]:
-    """Of points first to last that another scan can see under a motion (3,): how many are explained, how many there are, the sum
+    """What another scan says of points first to last under a motion (3,).
 
-    of their residuals (3,); and how many of them it sees through.
+    Returns:
+        (3,) of those that it can see: how many it explains, their number, the sum of their residuals; how many it sees through.
     """
     L = last - first + 1
     moved, residual, near = np.empty((2, L)), np.empty(L), np.empty(L, np.int64)
