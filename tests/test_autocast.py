@@ -7,7 +7,6 @@ from support import assert_close
 from torchcrf_scan import JointScanCRF, ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
-from torchcrf_scan.inference.uncertainty import WITHIN
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +36,7 @@ def test_messages_and_motions_keep_their_precision(model: JointScanCRF, batch: S
         half = model(batch, start)
     for found in (half.log_association, half.log_cluster, half.motions):
         assert found.dtype == torch.float32
-    is_same = (half.association - full.association).abs() <= WITHIN  # neighbours score alike to two digits
-    assert (is_same & ((half.association < 0) == (full.association < 0))).double().mean() > 0.99
+    assert (half.association == full.association).double().mean() > 0.98
     assert (half.cluster == full.cluster).double().mean() > 0.98
     assert_close(half.motions[:, 0], full.motions[:, 0].detach(), tolerance=5e-3)
     half.motions[:, 0].sum().backward()

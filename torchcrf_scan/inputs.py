@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -118,9 +119,18 @@ def check_tensor(
         raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
     device = like.device.type
     allowed = [like.dtype if dtype is None else dtype]
-    if is_learned and torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device):
+    if is_learned and _is_in_autocast(device):
         allowed.append(torch.get_autocast_dtype(device))
     if value.dtype not in allowed:
         raise ValueError(f"{name}: expected dtype {' or '.join(map(str, allowed))}, got {value.dtype}")
     if value.device != like.device:
         raise ValueError(f"{name}: expected device {like.device}, got {value.device}")
+
+
+def full_precision(device: str) -> AbstractContextManager[object]:
+    """Within it autocast is off; nothing where it is off already, so that exported graphs do not name it. device: its type."""
+    return torch.autocast(device, enabled=False) if _is_in_autocast(device) else nullcontext()
+
+
+def _is_in_autocast(device: str) -> bool:
+    return torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)

@@ -28,7 +28,7 @@ from torchcrf_scan.inference import joint, pseudo_likelihood
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import ClusterPotential, Parameters
 from torchcrf_scan.inference.uncertainty import Calibration
-from torchcrf_scan.inputs import check_batch, check_inputs, check_plugins, check_start
+from torchcrf_scan.inputs import check_batch, check_inputs, check_plugins, check_start, full_precision
 from torchcrf_scan.loops.choice import is_in_transform
 from torchcrf_scan.loops.pair import pair_of_scans
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, SCALED_EDGES
@@ -191,7 +191,7 @@ class JointScanCRF(nn.Module):
         begin = BEGINNINGS.get(self.config.start)
         if begin is None:
             return found
-        with torch.autocast(batch.source.device.type, enabled=False):  # centimetres decide which movers are found
+        with full_precision(batch.source.device.type):  # centimetres decide which movers are found
             view = replace(self.view(batch), limit=None)  # of the motions to be found from here
             return view.in_metres(begin(view, view.in_unit(found), self.fitted, self.config.inference))
 
@@ -272,11 +272,12 @@ class JointScanCRF(nn.Module):
     def _in_tensors(
         self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None, outlier_distance: float | Tensor | None
     ) -> Prediction:
-        """The rounds in tensors, all pairs at once, with a gradient if the schedule supports it."""
-        view = self.view(batch, learned, outlier_distance)  # features, in their unit of length
-        decode = DECODERS[self.config.inference.schedule]
-        found = decode(view, view.in_unit(start), self.fitted, self.config)
-        return view.in_metres(found)  # metres
+        """The rounds in tensors, all pairs at once, with a gradient if the schedule supports it; in full precision, as in loops."""
+        with full_precision(batch.source.device.type):
+            view = self.view(batch, learned, outlier_distance)  # features, in their unit of length
+            decode = DECODERS[self.config.inference.schedule]
+            found = decode(view, view.in_unit(start), self.fitted, self.config)
+            return view.in_metres(found)  # metres
 
     def unroll(self, batch: ScanPairBatch, start: Start, learned: LearnedInputs | None, config: ModelConfig, last: int) -> Unrolled:
         """The states after the last rounds, with a gradient: what losses on them are computed from.
@@ -287,11 +288,12 @@ class JointScanCRF(nn.Module):
         """
         if config.inference.iterations > 0 and self._suits_loops(config, batch, start, learned):
             return adjoint.unroll(batch, start, self.fitted, config, learned, last)
-        view = self.view(batch, learned, config.inference.outlier_distance)
-        rounds = sweep.rounds(view, view.in_unit(start), self.fitted, config)[-last:]
-        distance, looks = self.scales.cluster_distance, config.inference.backend != "eager"
-        merged = [replace(done, state=joint.merge_alike(view, done.state, distance, looks=looks)) for done in rounds]
-        return Unrolled(view.batch, view.factor, merged)
+        with full_precision(batch.source.device.type):
+            view = self.view(batch, learned, config.inference.outlier_distance)
+            rounds = sweep.rounds(view, view.in_unit(start), self.fitted, config)[-last:]
+            distance, looks = self.scales.cluster_distance, config.inference.backend != "eager"
+            merged = [replace(done, state=joint.merge_alike(view, done.state, distance, looks=looks)) for done in rounds]
+            return Unrolled(view.batch, view.factor, merged)
 
     def pseudo_log_likelihood(
         self,
