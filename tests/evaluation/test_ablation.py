@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from made_pairs import make_pair, perfect, perturbed
 
-from torchcrf_scan.evaluation.bootstrap import Interval, by_sequence, paired_intervals
+from torchcrf_scan.evaluation.bootstrap import Difference, by_sequence, paired_intervals
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import DIFFERENCES, OVERVIEW
 from torchcrf_scan.evaluation.summary import summarise
@@ -44,11 +44,11 @@ def test_every_variant_is_compared_on_its_own_pairs(scores: dict[str, list[PairS
             if name == "model":
                 assert found == "-"
             else:
-                assert isinstance(found, Interval)
-                assert (found.difference, found.low, found.high) == pytest.approx(
-                    (expected[key].difference, expected[key].low, expected[key].high), nan_ok=True
+                assert isinstance(found, Difference)
+                assert (found.value, found.low, found.high) == pytest.approx(
+                    (expected[key].value, expected[key].low, expected[key].high), nan_ok=True
                 )
-                assert not found.difference > 0  # the model is always right
+                assert not found.value > 0  # the model is always right
     times = [dict(zip(table.columns, row, strict=True))["time (ms)"] for row in table.rows]
     assert times == pytest.approx([250, 2500, 500])
     assert "* where it excludes zero" in table.to_markdown()

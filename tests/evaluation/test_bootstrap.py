@@ -8,11 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_pairs import make_pair, make_small, no_movers, perfect, perturbed, random_labels
 
-from torchcrf_scan.evaluation.bootstrap import Interval, by_blocks, by_sequence, paired_intervals
+from torchcrf_scan.evaluation.bootstrap import Difference, by_blocks, by_sequence, intervals, paired_intervals
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.summary import summarise
 
-KEYS = ("association_within_2", "association_accuracy", "cluster_accuracy", "iou_moving", "movers_found", "ego_success")
+SHARES = ("association_within_2", "association_accuracy", "cluster_accuracy", "iou_moving", "movers_found", "ego_success")
+LABELS = ("accuracy", "sed2", "outliers_found", "outliers_true", "recall_skipped")  # the paper's Tables I and II
+KEYS = {*SHARES, *(f"{of}_{name}" for of in ("association", "cluster") for name in LABELS), "motion_rotation", "motion_translation"}
 SEQUENCES = ("garage", "garage", "street", "street", "street", "yard")
 
 names = st.lists(st.sampled_from(["a", "b", "c"]), min_size=1, max_size=30)
@@ -104,29 +106,43 @@ def test_equal_seeds_give_equal_draws() -> None:
 
 
 @given(st.integers(1, 12), st.integers(0, 1000))
-def test_differences_are_those_of_the_summaries(pairs: int, seed: int) -> None:
+def test_values_and_differences_are_those_of_the_summaries(pairs: int, seed: int) -> None:
     ours, theirs = two_methods(pairs, seed)
-    intervals = paired_intervals(ours, theirs, by_blocks([score.sequence for score in ours], 2, 10))
-    assert tuple(intervals) == KEYS
-    for key, interval in intervals.items():
-        assert interval.difference == pytest.approx(summarise(ours)[key] - summarise(theirs)[key], abs=1e-9)
+    weights = by_blocks([score.sequence for score in ours], 2, 10)
+    our, their = summarise(ours), summarise(theirs)
+    differences, values = paired_intervals(ours, theirs, weights), intervals(ours, weights)
+    assert set(differences) == set(values) == KEYS
+    for key in KEYS:
+        assert differences[key].value == pytest.approx(our[key] - their[key], abs=1e-9, nan_ok=True)
+        assert values[key].value == pytest.approx(our[key], abs=1e-9, nan_ok=True)
+        assert not values[key].low > values[key].high
+
+
+def test_levels_are_resampled_like_the_pairs() -> None:
+    """A resample without any correct object says nothing of its errors, and is left out."""
+    ours, _ = two_methods(6)
+    weights = np.array([[2, 0, 1, 3, 0, 0], [0, 1, 0, 0, 2, 1], [1, 1, 1, 1, 1, 1]])
+    drawn = [[i for i, n in enumerate(row) for _ in range(n)] for row in weights]
+    for key, interval in intervals(ours, weights).items():
+        low, high = np.nanpercentile([summarise([ours[i] for i in row])[key] for row in drawn], [2.5, 97.5])
+        assert (interval.low, interval.high) == pytest.approx((low, high), abs=1e-9)
 
 
 def test_resamples_are_summarised_like_the_pairs() -> None:
     ours, theirs = two_methods(6)
     weights = np.array([[2, 0, 1, 3, 0, 0], [0, 0, 0, 0, 0, 1]])
-    intervals = paired_intervals(ours, theirs, weights)
+    differences = paired_intervals(ours, theirs, weights)
     drawn = [[i for i, n in enumerate(row) for _ in range(n)] for row in weights]
-    for key in KEYS:
+    for key in SHARES:
         resampled = [summarise([ours[i] for i in row])[key] - summarise([theirs[i] for i in row])[key] for row in drawn]
         low, high = np.percentile(resampled, [2.5, 97.5])
-        assert (intervals[key].low, intervals[key].high) == pytest.approx((low, high), abs=1e-9)
+        assert (differences[key].low, differences[key].high) == pytest.approx((low, high), abs=1e-9)
 
 
 def test_a_method_does_not_differ_from_itself() -> None:
     ours, _ = two_methods(9)
     for interval in paired_intervals(ours, list(ours), by_blocks([score.sequence for score in ours], 2, 100)).values():
-        assert interval == Interval(0.0, 0.0, 0.0)
+        assert interval == Difference(0.0, 0.0, 0.0)
         assert not interval.excludes_zero
 
 
@@ -135,7 +151,7 @@ def test_a_certain_difference_is_told() -> None:
     interval = paired_intervals(with_right([11] * 20, sequences), with_right([0] * 20, sequences), by_blocks(sequences, 5, 100))[
         "cluster_accuracy"
     ]
-    assert interval == Interval(100.0, 100.0, 100.0)
+    assert interval == Difference(100.0, 100.0, 100.0)
     assert interval.excludes_zero
 
 
@@ -143,7 +159,7 @@ def test_a_certain_difference_is_told() -> None:
 def test_resamples_that_are_all_the_same_have_no_bounds(weights: np.ndarray) -> None:
     ours, theirs = with_right([9] * 6, ["a"] * 6), with_right([3] * 6, ["a"] * 6)
     interval = paired_intervals(ours, theirs, weights)["cluster_accuracy"]
-    assert interval.difference == pytest.approx(600 / 11)
+    assert interval.value == pytest.approx(600 / 11)
     assert math.isnan(interval.low)
     assert math.isnan(interval.high)
     assert not interval.excludes_zero
@@ -151,7 +167,7 @@ def test_resamples_that_are_all_the_same_have_no_bounds(weights: np.ndarray) -> 
 
 @pytest.mark.parametrize(("low", "high", "excludes"), [(0.1, 2.0, True), (-2.0, -0.1, True), (-0.1, 0.1, False), (0.0, 1.0, False)])
 def test_an_interval_excludes_zero_on_one_side_of_it(low: float, high: float, excludes: bool) -> None:
-    assert Interval((low + high) / 2, low, high).excludes_zero is excludes
+    assert Difference((low + high) / 2, low, high).excludes_zero is excludes
 
 
 def test_intervals_cover_a_known_difference() -> None:

@@ -8,7 +8,7 @@ from made_pairs import make_pair, perturbed
 
 from torchcrf_scan.evaluation.measures import EVERY, MEASURES, Labelled, inliers_right, target_distance
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
-from torchcrf_scan.evaluation.report import association_table, detection_table
+from torchcrf_scan.evaluation.report import report
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.scan import ScanPair
 
@@ -44,8 +44,8 @@ def test_distance_between_the_true_and_the_predicted_return() -> None:
 def test_every_measure_has_its_figure_and_its_column() -> None:
     scores = {"method": [a_score()]}
     figures = summarise(scores["method"])
-    for table, make in (("association", association_table), ("detection", detection_table)):
-        columns = make(scores).columns
+    columns = {column for table in report(scores) for column in table.columns}
+    for table in MEASURES:
         for key, measure in MEASURES[table].items():
             assert measure.heading in columns
             part, whole = scores["method"][0].counts[key]

@@ -6,22 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torchcrf_scan.evaluation.bootstrap import Interval, by_blocks, paired_intervals
+from torchcrf_scan.evaluation.bootstrap import Difference, Interval, by_blocks, intervals, paired_intervals
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import (
     PUBLISHED_HEADING,
     PUBLISHED_NOTE,
     SURENESS_NOTE,
-    Table,
-    association_table,
-    detection_table,
     differences_table,
-    estimation_table,
     overview_table,
     report,
+    sequences_table,
     sureness_table,
 )
 from torchcrf_scan.evaluation.summary import summarise
+from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
 
 
@@ -49,7 +47,13 @@ def test_tables_have_one_row_per_method(scores: dict[str, list[PairScore]]) -> N
     for table in report(scores):
         assert [row[0] for row in table.rows] == ["right", "nothing"]
         assert table.columns[0] == "method"
-    assert [table.title.split(":")[0] for table in report(scores)] == ["Overview", "Table I", "Table II", "Table III", "How sure"]
+    papers = [f"Table {number}{more}" for number in ("I", "II", "III") for more in ("", ", more")]
+    assert [table.title.split(":")[0] for table in report(scores)] == ["Overview", *papers, "How sure"]
+
+
+def titled(title: str, scores: dict[str, list[PairScore]], **options: object) -> Table:
+    """The table of a report with this title, up to the colon."""
+    return next(table for table in report(scores, **options) if table.title.split(":")[0] == title)
 
 
 def cell(table: Table, method: str, column: str) -> object:
@@ -61,17 +65,18 @@ def test_tables_hold_the_figures_of_the_summary(scores: dict[str, list[PairScore
     nothing = summarise(scores["nothing"])
     assert cell(overview_table(scores), "right", "ego within 5 cm and 1 deg (%)") == 100
     assert cell(overview_table(scores), "nothing", "outlier precision (%)") == nothing["association_precision"] == 12.5
-    assert cell(association_table(scores), "nothing", "SED2") == nothing["association_sed2"] == 14
-    assert cell(association_table(scores), "nothing", "outliers found (%)") == 100
-    assert cell(detection_table(scores), "nothing", "accuracy (%)") == nothing["cluster_accuracy"] == 12.5
-    assert cell(estimation_table(scores), "right", "objects") == 4
-    assert np.isnan(cell(estimation_table(scores), "nothing", "translation (m)"))
+    assert cell(titled("Table I", scores), "nothing", "SED2") == nothing["association_sed2"] == 14
+    assert cell(titled("Table I", scores), "nothing", "outliers found (%)") == 100
+    assert cell(titled("Table II", scores), "nothing", "accuracy (%)") == nothing["cluster_accuracy"] == 12.5
+    assert cell(titled("Table III, more", scores), "right", "objects") == 4
+    assert np.isnan(cell(titled("Table III", scores), "nothing", "translation (m)"))
 
 
 def test_overview_has_the_columns_of_the_reference_table(scores: dict[str, list[PairScore]]) -> None:
     assert overview_table(scores).columns == (
         "method",
         "ego within 5 cm and 1 deg (%)",
+        "association exact (%)",
         "association within +-2 (%)",
         "cluster accuracy (%)",
         "IoU of moving points (%)",
@@ -82,15 +87,16 @@ def test_overview_has_the_columns_of_the_reference_table(scores: dict[str, list[
 
 
 def test_tables_have_the_columns_of_the_paper_and_more(scores: dict[str, list[PairScore]]) -> None:
-    paper = {"accuracy (%)", "SED1", "SED2", "outliers found (%)", "outliers true (%)", "ratio (%)", "precision (%)"}
-    assert paper | {"within +-1 (%)", "within +-2 (%)"} <= set(association_table(scores).columns)
-    assert paper | {"IoU of moving points (%)", "movers found (%)"} <= set(detection_table(scores).columns)
-    kinds = ("", "background ", "mover ")
-    assert {f"{kind}{of}" for kind in kinds for of in ("rotation (rad)", "translation (m)")} <= set(
-        estimation_table(scores).columns
-    )
-    assert cell(detection_table(scores), "nothing", "movers found (%)") == 0
-    assert cell(association_table(scores), "right", "within +-2 (%)") == 100
+    labels = ("method", "accuracy (%)", "SED2", "outliers found (%)", "outliers true (%)", "ratio (%)")
+    assert titled("Table I", scores).columns == titled("Table II", scores).columns == labels
+    assert titled("Table III", scores).columns == ("method", "rotation (rad)", "translation (m)")
+    more = {"SED1", "precision (%)"}
+    assert more | {"within +-1 (%)", "within +-2 (%)"} <= set(titled("Table I, more", scores).columns)
+    assert more | {"IoU of moving points (%)", "movers found (%)"} <= set(titled("Table II, more", scores).columns)
+    errors = {f"{kind} {of}" for kind in ("background", "mover") for of in ("rotation (rad)", "translation (m)")}
+    assert errors <= set(titled("Table III, more", scores).columns)
+    assert cell(titled("Table II, more", scores), "nothing", "movers found (%)") == 0
+    assert cell(titled("Table I, more", scores), "right", "within +-2 (%)") == 100
 
 
 def test_how_sure_has_the_figures_of_the_summary(scores: dict[str, list[PairScore]]) -> None:
@@ -127,11 +133,10 @@ def test_times_are_medians_in_milliseconds(scores: dict[str, list[PairScore]]) -
     assert all("time (ms)" not in other.columns for other in report(scores, seconds={"right": [0.1]})[1:])
 
 
-def test_published_numbers_stand_at_the_right_of_their_row(scores: dict[str, list[PairScore]]) -> None:
+def test_published_numbers_stand_beside_ours(scores: dict[str, list[PairScore]]) -> None:
     rows = dict.fromkeys(("ICP", "ICP, tuned", "K-Means (ICP)", "joint"), scores["right"])
-    overview, association, detection, estimation, sureness = report(rows, published=True)
-    assert overview == overview_table(rows)
-    assert sureness.to_markdown() == sureness_table(rows).to_markdown()
+    association, detection, estimation = (titled(f"Table {number}", rows, published=True) for number in ("I", "II", "III"))
+    assert titled("Overview", rows, published=True) == overview_table(rows)
     assert cell(association, "ICP, tuned", f"{PUBLISHED_HEADING}accuracy (%)") == 69.19
     assert cell(association, "joint", f"{PUBLISHED_HEADING}SED") == 96.13
     assert math.isnan(cell(association, "ICP", f"{PUBLISHED_HEADING}ratio (%)"))
@@ -139,8 +144,10 @@ def test_published_numbers_stand_at_the_right_of_their_row(scores: dict[str, lis
     assert math.isnan(cell(detection, "ICP, tuned", f"{PUBLISHED_HEADING}accuracy (%)"))
     assert cell(estimation, "joint", f"{PUBLISHED_HEADING}translation (m)") == 0.56
     for table, number in ((association, 5), (detection, 5), (estimation, 2)):
-        assert sum(column.startswith(PUBLISHED_HEADING) for column in table.columns) == number
-        assert all(column.startswith(PUBLISHED_HEADING) for column in table.columns[-number:])
+        assert len(table.columns) == 1 + 2 * number
+        assert all(column.startswith(PUBLISHED_HEADING) for column in table.columns[2::2])
+        ours = [column.split(" ")[0].rstrip("2") for column in table.columns[1::2]]  # SED2 beside SED
+        assert [column.removeprefix(PUBLISHED_HEADING).split(" ")[0] for column in table.columns[2::2]] == ours
         assert f"\n\n{PUBLISHED_NOTE}\n\n| method |" in table.to_markdown()
 
 
@@ -149,7 +156,32 @@ def test_published_numbers_need_a_row_and_a_wish(scores: dict[str, list[PairScor
         assert asked.to_markdown() == plain.to_markdown()
     joint = {"joint": scores["right"]}
     assert all(not column.startswith(PUBLISHED_HEADING) for table in report(joint) for column in table.columns)
-    assert PUBLISHED_NOTE not in association_table(joint).to_markdown()
+    assert PUBLISHED_NOTE not in titled("Table I", joint).to_markdown()
+
+
+def test_the_papers_columns_have_intervals(drive: dict[str, list[PairScore]]) -> None:
+    weights = by_blocks(["a"] * 8, 3, 200)
+    for title, prefix in (("Table I", "association"), ("Table II", "cluster")):
+        table = titled(title, drive, published=True, weights=weights)
+        for method, of_method in drive.items():
+            expected = intervals(of_method, weights)
+            assert cell(table, method, "SED2") == expected[f"{prefix}_sed2"]
+            assert cell(table, method, "ratio (%)") == expected[f"{prefix}_recall_skipped"]
+    assert "| joint | 100.00 [100.00, 100.00] | 74.13 |" in titled("Table I", drive, published=True, weights=weights).to_markdown()
+    found = cell(titled("Table I", drive, weights=weights), "sometimes", "accuracy (%)")
+    assert found.low < found.value < found.high
+    assert titled("Table III", drive, weights=weights).rows[1][2] != titled("Table III", drive).rows[1][2]  # no motion: no interval
+    assert "| nothing | - | - |" in titled("Table III", drive, weights=weights).to_markdown()
+
+
+def test_sequences_stand_apart(scores: dict[str, list[PairScore]]) -> None:
+    """Every sequence has its own rows, one a method, in the order of the sequences; numbers are those of its pairs alone."""
+    right, nothing = scores["right"][0], scores["nothing"][0]
+    mixed = [replace(right, sequence="b"), replace(nothing, sequence="b"), replace(right, sequence="a")]
+    table = sequences_table({"mixed": mixed, "right": [replace(right, sequence=like.sequence) for like in mixed]})
+    assert [row[:3] for row in table.rows] == [("b", "mixed", 2), ("b", "right", 2), ("a", "mixed", 1), ("a", "right", 1)]
+    exact = table.columns.index("association exact (%)")
+    assert [row[exact] for row in table.rows] == [(100 + 12.5) / 2, 100, 100, 100]
 
 
 @pytest.fixture
@@ -166,11 +198,11 @@ def test_differences_are_the_paired_intervals(drive: dict[str, list[PairScore]])
     assert [row[0] for row in table.rows] == ["nothing", "sometimes", "same"]
     assert table.columns == ("method", "association within +-2", "cluster accuracy", "IoU of moving points", "movers found")
     for method in ("nothing", "sometimes", "same"):
-        intervals = paired_intervals(drive["joint"], drive[method], weights)
-        assert cell(table, method, "cluster accuracy") == intervals["cluster_accuracy"]
-        assert cell(table, method, "association within +-2") == intervals["association_within_2"]
-        assert cell(table, method, "movers found") == intervals["movers_found"]
-        assert cell(table, method, "IoU of moving points") == intervals["iou_moving"]
+        expected = paired_intervals(drive["joint"], drive[method], weights)
+        assert cell(table, method, "cluster accuracy") == expected["cluster_accuracy"]
+        assert cell(table, method, "association within +-2") == expected["association_within_2"]
+        assert cell(table, method, "movers found") == expected["movers_found"]
+        assert cell(table, method, "IoU of moving points") == expected["iou_moving"]
 
 
 def test_differences_read_well_in_markdown(drive: dict[str, list[PairScore]]) -> None:
@@ -183,7 +215,7 @@ def test_differences_read_well_in_markdown(drive: dict[str, list[PairScore]]) ->
 
 def test_differences_have_columns_of_their_own_in_csv() -> None:
     table = Table(
-        "t", ("method", "found"), (("a", Interval(1.5, -0.25, 3.0)), ("b", Interval(2.0, math.nan, math.nan)), ("c", 4.0))
+        "t", ("method", "found"), (("a", Difference(1.5, -0.25, 3.0)), ("b", Difference(2.0, math.nan, math.nan)), ("c", 4.0))
     )
     rows = list(csv.reader(io.StringIO(table.to_csv())))
     assert rows == [
@@ -194,10 +226,12 @@ def test_differences_have_columns_of_their_own_in_csv() -> None:
     ]
 
 
-def test_intervals_in_markdown_have_signs_and_marks() -> None:
-    cells = (Interval(-2.04, -3.0, -1.0), Interval(-0.001, -1.0, 0.0), Interval(3.0, math.nan, math.nan))
+def test_differences_in_markdown_have_signs_and_marks() -> None:
+    cells = (Difference(-2.04, -3.0, -1.0), Difference(-0.001, -1.0, 0.0), Difference(3.0, math.nan, math.nan))
     table = Table("t", ("x",), tuple((cell,) for cell in cells), (1,))
     assert table.to_markdown().splitlines()[4:] == ["| -2.0 [-3.0, -1.0] * |", "| +0.0 [-1.0, 0.0] |", "| +3.0 [-, -] |"]
+    levels = Table("t", ("x",), ((Interval(2.04, 1.0, 3.0),), (Interval(math.nan, math.nan, math.nan),)), (1,))
+    assert levels.to_markdown().splitlines()[4:] == ["| 2.0 [1.0, 3.0] |", "| - |"]
 
 
 def test_differences_need_the_reference_and_the_same_pairs(drive: dict[str, list[PairScore]]) -> None:

@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.evaluation.metrics import score_pair
-from torchcrf_scan.evaluation.report import Table
+from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.experiment import experiment as module
 from torchcrf_scan.experiment.experiment import (
     claim,
@@ -138,7 +138,7 @@ def pair_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], 
     for pair in make_pairs(*"aabc"):
         write_pair(tmp_path / "pairs" / f"{pair.name}.npz", pair)
     monkeypatch.setattr(Study, "of", lambda pairs, config, jobs: make_study(pairs))
-    for name in ("plot_associations", "plot_clusters"):
+    for name in ("plot_associations", "plot_association_sequence", "plot_cluster_sequence"):
         monkeypatch.setattr(module, name, lambda pair, predictions: Figure((0.2, 0.2)))  # drawing takes time, and has its own tests
     experiment = replace(SMALL, pairs=str(tmp_path / "pairs"))
     return lambda **changes: RunConfig(output=str(tmp_path / "run"), experiment=replace(experiment, **changes))

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from torchcrf_scan.evaluation.report import Table
+from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.learning.run_log import RunLog
 
 

@@ -8,7 +8,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.model import ClusteringCRF, MatchingCRF
 from torchcrf_scan.prediction import Prediction
-from torchcrf_scan.variants.paper_start import movers_from_associations
+from torchcrf_scan.variants.paper_start import movers_from_associations, paper_start
 
 
 class Cascade:
@@ -16,6 +16,13 @@ class Cascade:
 
     def __init__(self, matching: MatchingCRF, clustering: ClusteringCRF) -> None:
         self.matching, self.clustering = matching, clustering
+
+    @torch.no_grad()
+    def match_from_own_start(self, batch: ScanPairBatch, start: Start) -> Prediction:
+        """CRF-Matching from the motion that it finds itself, by shape alone (spec 7.3). start: its motions are not used."""
+        view = self.matching.view(batch)
+        own = paper_start(view, view.in_unit(start.background_alone()), self.matching.fitted, self.matching.config.inference)
+        return self.matching(batch, view.in_metres(own))
 
     @torch.no_grad()
     def feed(self, batch: ScanPairBatch, start: Start) -> Start:

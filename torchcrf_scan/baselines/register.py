@@ -81,6 +81,9 @@ BASELINES: Mapping[str, Baseline] = {
     "CRF-Matching": Baseline(
         lambda case: case.cascade.matching(case.batch, case.start.background_alone()).pair(0, case.pair), from_start=True
     ),
+    "CRF-Matching, own start": Baseline(
+        lambda case: case.cascade.match_from_own_start(case.batch, case.start).pair(0, case.pair), from_start=True
+    ),
     "K-Means (CRF-Matching)": k_means("CRF-Matching"),
     "K-Means (CRF-Matching), ego removed": k_means("CRF-Matching", remove_motion=True),
     "CRF-Clustering": Baseline(lambda case: case.cascade(case.batch, case.start).pair(0, case.pair), from_start=True),

@@ -14,7 +14,7 @@ from typing import Any
 
 from torchcrf_scan.benchmark.limits import Rates
 from torchcrf_scan.benchmark.plan import WHOLE
-from torchcrf_scan.evaluation.report import Table
+from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.whole_file import write_whole
 
 Row = Mapping[str, Any]

@@ -15,7 +15,7 @@ from torchcrf_scan.whole_file import write_whole
 
 if TYPE_CHECKING:
     from torchcrf_scan.evaluation.metrics import PairScore
-    from torchcrf_scan.evaluation.report import Table
+    from torchcrf_scan.evaluation.table import Table
 
 REPORT = "causes.md"
 

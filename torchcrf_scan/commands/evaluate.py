@@ -28,7 +28,7 @@ from torchcrf_scan.whole_file import write_whole
 if TYPE_CHECKING:
     from torchcrf_scan.evaluation.metrics import PairScore
     from torchcrf_scan.evaluation.neighbours import NeighbourScore
-    from torchcrf_scan.evaluation.report import Table
+    from torchcrf_scan.evaluation.table import Table
 
 Item = TypeVar("Item")
 Method = Callable[[Sequence[ScanPair]], list[PairPrediction]]
@@ -191,7 +191,7 @@ def _in_batches(method: Callable[[Sequence[Item]], list[PairPrediction]], items:
 
 def _displaced_table(displacement: FrameOffset, rows: dict[str, list[PairScore]]) -> Table:
     """Share of ego motions found with displaced frames."""
-    from torchcrf_scan.evaluation.report import Table
+    from torchcrf_scan.evaluation.table import Table
 
     heading = f"ego within {100 * FAR_TRANSLATION:.0f} cm and {FAR_ROTATION:g} rad (%)"
     shares = tuple((name, _found_from_afar(scores)) for name, scores in rows.items())

@@ -1,18 +1,20 @@
-"""95 % intervals for the difference of two methods on the same pairs, by a paired bootstrap.
+"""95 % intervals of a method's metrics, and of the difference of two methods on the same pairs, by a bootstrap over pairs.
 
-A resample is a row of weights, how often each pair is drawn; both methods are averaged with the same weights. Pairs of
+A resample is a row of weights, how often each pair is drawn; two methods are averaged with the same weights. Pairs of
 one recording are correlated, so they are drawn with their whole sequence, or in blocks of consecutive pairs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from torchcrf_scan.evaluation.metrics import PairScore
-from torchcrf_scan.evaluation.summary import EGO_ROTATION, EGO_TRANSLATION
+from torchcrf_scan.evaluation.measures import Count
+from torchcrf_scan.evaluation.metrics import LabelScore, PairScore
+from torchcrf_scan.evaluation.summary import EGO_ROTATION, EGO_TRANSLATION, correct_errors
 from torchcrf_scan.scan import Floats, Ints
 
 PERCENTILES = (2.5, 97.5)
@@ -20,21 +22,39 @@ PERCENTILES = (2.5, 97.5)
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A difference and its 95 % interval.
+    """A metric over all pairs and its 95 % interval.
 
     Attributes:
-        difference: over all pairs, percentage points.
-        low, high: bounds, percentage points; NaN if undetermined.
+        value: over all pairs. low, high: bounds; NaN if undetermined.
     """
 
-    difference: float
+    value: float
     low: float
     high: float
+
+
+class Difference(Interval):
+    """A difference of two methods and its 95 % interval."""
+
+    __slots__ = ()
 
     @property
     def excludes_zero(self) -> bool:
         """Whether the interval lies on one side of zero; False for unknown bounds."""
         return self.low > 0 or self.high < 0
+
+
+@dataclass(frozen=True, slots=True)
+class Ratio:
+    """A metric of many pairs as the ratio of two sums.
+
+    Attributes:
+        count: numerator and denominator of a pair. scale: of the ratio, 100 for percent. empty: value of an empty denominator.
+    """
+
+    count: Callable[[PairScore], Count]
+    scale: float = 100.0
+    empty: float = 0.0
 
 
 def by_sequence(sequences: Sequence[str], resamples: int = 10_000, seed: int = 0) -> Ints:
@@ -86,65 +106,112 @@ def by_blocks(sequences: Sequence[str], block: int = 5, resamples: int = 10_000,
     return weights
 
 
-def paired_intervals(ours: Sequence[PairScore], theirs: Sequence[PairScore], weights: Ints) -> dict[str, Interval]:
-    """Differences of the metrics of two methods with 95 % percentile intervals.
+def intervals(scores: Sequence[PairScore], weights: Ints) -> dict[str, Interval]:
+    """The `RATIOS` of a method with 95 % percentile intervals, by their key of `summary.summarise`. O(R P) time.
 
-    The metrics are those of `summary.summarise`, with 0 for an empty denominator, in the resamples too. If all resamples are the
-    same the spread is undetermined, and the bounds are NaN. O(R P) time.
+    If all resamples are the same the spread is undetermined, and the bounds are NaN.
 
     Args:
-        ours, theirs: scores of the same P pairs in the same order.
-        weights: (R, P) how often each pair is drawn, from `by_sequence` or `by_blocks`.
+        scores: of P pairs. weights: (R, P) how often each pair is drawn, from `by_sequence` or `by_blocks`.
 
-    Returns:
-        `association_within_2`, `association_accuracy`, `cluster_accuracy`, `iou_moving`, `movers_found` and `ego_success`: ours
-        minus theirs.
+    Raises:
+        ValueError: weights of another shape.
+    """
+    once, resampled = _over_all(scores, weights)
+    return {key: Interval(*numbers) for key, numbers in _spread(once, resampled, weights)}
+
+
+def paired_intervals(ours: Sequence[PairScore], theirs: Sequence[PairScore], weights: Ints) -> dict[str, Difference]:
+    """Differences of the `RATIOS` of two methods, ours minus theirs, with 95 % percentile intervals; else as `intervals`.
+
+    Args:
+        ours, theirs: scores of the same P pairs in the same order. weights: (R, P), as in `intervals`.
 
     Raises:
         ValueError: no pairs, other pairs, or weights of another shape.
     """
     _check_same_pairs(ours, theirs)
-    if weights.ndim != 2 or weights.shape[1] != len(ours) or not len(weights):
-        raise ValueError(f"weights: expected shape (resamples, {len(ours)}), got {weights.shape}")
-    once = np.ones((1, len(ours)), dtype=np.int64)
-    difference = (_figures(ours, once) - _figures(theirs, once))[0]  # (F,)
-    resampled = _figures(ours, weights) - _figures(theirs, weights)  # (R, F)
-    low, high = np.percentile(resampled, PERCENTILES, axis=0)
-    if (weights == weights[0]).all():
-        low, high = np.full((2, len(difference)), np.nan)
-    bounds = zip(difference.tolist(), low.tolist(), high.tolist(), strict=True)
-    return {key: Interval(*numbers) for key, numbers in zip(_SHARES, bounds, strict=True)}
+    (our, our_resampled), (their, their_resampled) = _over_all(ours, weights), _over_all(theirs, weights)
+    return {key: Difference(*numbers) for key, numbers in _spread(our - their, our_resampled - their_resampled, weights)}
 
 
-def _share(part: float, whole: float) -> tuple[float, float]:
+def _over_all(scores: Sequence[PairScore], weights: Ints) -> tuple[Floats, Floats]:
+    """(F,) the ratios over all pairs, and (R, F) over every resample."""
+    if weights.ndim != 2 or weights.shape[1] != len(scores) or not len(weights):
+        raise ValueError(f"weights: expected shape (resamples, {len(scores)}), got {weights.shape}")
+    return _figures(scores, np.ones((1, len(scores)), dtype=np.int64))[0], _figures(scores, weights)
+
+
+def _spread(once: Floats, resampled: Floats, weights: Ints) -> Iterator[tuple[str, tuple[float, float, float]]]:
+    """Key, value and bounds of every ratio. Resamples without the ratio are left out."""
+    for key, value, column in zip(RATIOS, once.tolist(), resampled.T, strict=True):
+        known = column[np.isfinite(column)]
+        is_fixed = not len(known) or (weights == weights[0]).all()
+        low, high = (math.nan, math.nan) if is_fixed else np.percentile(known, PERCENTILES).tolist()
+        yield key, (value, low, high)
+
+
+def _share(part: float, whole: float) -> Count:
     """Numerator and denominator of one pair in a mean of shares over pairs; an empty share counts as 0."""
     return (part / whole if whole else 0.0), 1.0
 
 
-def _found_movers(score: PairScore) -> tuple[float, float]:
+def _defined(part: float, whole: float) -> Count:
+    """The same, but a pair with an empty share is left out."""
+    return (part / whole, 1.0) if whole else (0.0, 0.0)
+
+
+def _found_movers(score: PairScore) -> Count:
     counted = [thing for thing in score.objects if thing.is_counted]
     return sum(thing.is_found for thing in counted), len(counted)
 
 
-def _good_ego(score: PairScore) -> tuple[float, float]:
+def _good_ego(score: PairScore) -> Count:
     return score.has_ego_truth and score.has_ego_within(EGO_TRANSLATION, EGO_ROTATION), score.has_ego_truth
 
 
-_SHARES: dict[str, Callable[[PairScore], tuple[float, float]]] = {  # a metric is 100 * sum of first / sum of second
-    "association_within_2": lambda score: _share(score.within_2, score.association.points),
-    "association_accuracy": lambda score: _share(score.association.right, score.association.points),
-    "cluster_accuracy": lambda score: _share(score.cluster.right, score.cluster.points),
-    "iou_moving": lambda score: (score.moving_both, score.moving_either),
-    "movers_found": _found_movers,
-    "ego_success": _good_ego,
+def _of_labels(prefix: str, label: Callable[[PairScore], LabelScore]) -> dict[str, Ratio]:
+    """The columns of the paper's Tables I and II."""
+    return {
+        f"{prefix}_accuracy": Ratio(lambda score: _share(label(score).right, label(score).points)),
+        f"{prefix}_sed2": Ratio(lambda score: (label(score).sed2, 1.0), scale=1.0),
+        f"{prefix}_outliers_found": Ratio(lambda score: _share(label(score).outliers_predicted, label(score).points)),
+        f"{prefix}_outliers_true": Ratio(lambda score: _share(label(score).outliers_true, label(score).points)),
+        f"{prefix}_recall_skipped": Ratio(
+            lambda score: _defined(label(score).outliers_both, label(score).outliers_true), empty=math.nan
+        ),
+    }
+
+
+def _of_errors(name: str) -> Ratio:
+    """A column of the paper's Table III: the mean error of the correctly clustered objects."""
+
+    def count(score: PairScore) -> Count:
+        errors = correct_errors(score.objects)
+        return sum(getattr(error, name) for error in errors), len(errors)
+
+    return Ratio(count, scale=1.0, empty=math.nan)
+
+
+RATIOS: Mapping[str, Ratio] = {  # by key of `summary.summarise`
+    "association_within_2": Ratio(lambda score: _share(score.within_2, score.association.points)),
+    **_of_labels("association", lambda score: score.association),
+    **_of_labels("cluster", lambda score: score.cluster),
+    "iou_moving": Ratio(lambda score: (score.moving_both, score.moving_either)),
+    "movers_found": Ratio(_found_movers),
+    "ego_success": Ratio(_good_ego),
+    "motion_rotation": _of_errors("rotation"),
+    "motion_translation": _of_errors("translation"),
 }
 
 
 def _figures(scores: Sequence[PairScore], weights: Ints) -> Floats:
-    """(R, F) percentages over the weighted pairs, 0 for an empty denominator."""
-    shares = np.array([[share(score) for share in _SHARES.values()] for score in scores], dtype=np.float64)  # (P, F, 2)
-    parts, wholes = (weights.astype(np.float64) @ shares[..., i] for i in (0, 1))  # (R, P) @ (P, F) -> (R, F)
-    return np.divide(100.0 * parts, wholes, out=np.zeros_like(parts), where=wholes > 0)
+    """(R, F) ratios over the weighted pairs."""
+    counts = np.array([[ratio.count(score) for ratio in RATIOS.values()] for score in scores], dtype=np.float64)  # (P, F, 2)
+    parts, wholes = (weights.astype(np.float64) @ counts[..., i] for i in (0, 1))  # (R, P) @ (P, F) -> (R, F)
+    parts = parts * [ratio.scale for ratio in RATIOS.values()]
+    empty = np.broadcast_to([ratio.empty for ratio in RATIOS.values()], parts.shape)
+    return np.divide(parts, wholes, out=empty.copy(), where=wholes > 0)
 
 
 def _block_counts(length: int, block: int, resamples: int, generator: np.random.Generator) -> Ints:

@@ -11,8 +11,9 @@ import numpy as np
 
 from torchcrf_scan.evaluation.calibration import Rightness, rightness
 from torchcrf_scan.evaluation.panoptic import PanopticCount, panoptic_quality
-from torchcrf_scan.evaluation.report import Cell, Column, Table
+from torchcrf_scan.evaluation.report import Column
 from torchcrf_scan.evaluation.scene_flow import FlowErrors, bucket_normalised, end_point_errors, moving_shares
+from torchcrf_scan.evaluation.table import Cell, Table
 from torchcrf_scan.scan import Bools, Floats, PairPrediction, ScanPair
 
 RANGES = (0.0, 5.0, 10.0, 20.0, 40.0, math.inf)  # metres

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 from torchcrf_scan.evaluation import published as paper
-from torchcrf_scan.evaluation.bootstrap import Interval, paired_intervals
+from torchcrf_scan.evaluation.bootstrap import intervals, paired_intervals
 from torchcrf_scan.evaluation.measures import MEASURES
 from torchcrf_scan.evaluation.metrics import PairScore
 from torchcrf_scan.evaluation.summary import summarise
+from torchcrf_scan.evaluation.table import Cell, Table
 from torchcrf_scan.scan import Ints
 
-Cell = str | float | Interval
 Column = tuple[str, str, int]  # heading, key of `summarise`, digits after the point
 
 OVERVIEW: tuple[Column, ...] = (
     ("ego within 5 cm and 1 deg (%)", "ego_success", 1),
+    ("association exact (%)", "association_accuracy", 1),
     ("association within +-2 (%)", "association_within_2", 1),
     ("cluster accuracy (%)", "cluster_accuracy", 1),
     ("IoU of moving points (%)", "iou_moving", 1),
@@ -34,21 +34,30 @@ DIFFERENCES: tuple[tuple[str, str], ...] = (  # heading, key of `paired_interval
     ("IoU of moving points", "iou_moving"),
     ("movers found", "movers_found"),
 )
-PUBLISHED_HEADING = "published, other data: "
-PUBLISHED_NOTE = "The columns 'published, other data' are the paper's numbers for its own pairs, not for those of this table."
+PUBLISHED_HEADING = "published: "
+PUBLISHED_NOTE = (
+    "'published' is the paper's number, for its own pairs, not for those of this table; its 'ICP' stands beside 'ICP, tuned', "
+    "whose gate finds the same share of outliers. In brackets 95 % intervals of a bootstrap."
+)
 DIFFERENCES_NOTE = "Difference [95 % interval of a paired bootstrap], in percentage points; * where the interval excludes zero."
 
 
-def _label_columns(prefix: str) -> tuple[Column, ...]:
-    """The columns of Tables I and II; the paper's SED fits SED2 only, both are given (A-21)."""
+def _paper_columns(prefix: str) -> tuple[Column, ...]:
+    """The paper's columns of Tables I and II; its SED fits SED2 only (A-21), and it has no undefined ratio."""
     return (
         ("accuracy (%)", f"{prefix}_accuracy", 2),
         ("SED2", f"{prefix}_sed2", 2),
-        ("SED1", f"{prefix}_sed1", 2),
         ("outliers found (%)", f"{prefix}_outliers_found", 2),
         ("outliers true (%)", f"{prefix}_outliers_true", 2),
-        ("ratio (%)", f"{prefix}_recall", 2),
-        ("ratio, undefined skipped (%)", f"{prefix}_recall_skipped", 2),
+        ("ratio (%)", f"{prefix}_recall_skipped", 2),
+    )
+
+
+def _more_columns(prefix: str) -> tuple[Column, ...]:
+    """What the paper does not print of the same labels."""
+    return (
+        ("SED1", f"{prefix}_sed1", 2),
+        ("ratio, undefined 0 (%)", f"{prefix}_recall", 2),
         ("precision (%)", f"{prefix}_precision", 2),
         ("precision, undefined skipped (%)", f"{prefix}_precision_skipped", 2),
     )
@@ -59,21 +68,25 @@ def _counted(table: str) -> tuple[Column, ...]:
     return tuple((measure.heading, key, measure.digits) for key, measure in MEASURES[table].items())
 
 
-ASSOCIATION: tuple[Column, ...] = (
-    *_label_columns("association"),
+ASSOCIATION = _paper_columns("association")
+ASSOCIATION_MORE: tuple[Column, ...] = (
     ("within +-1 (%)", "association_within_1", 2),
     ("within +-2 (%)", "association_within_2", 2),
     *_counted("association"),
+    *_more_columns("association"),
 )
-DETECTION: tuple[Column, ...] = (
-    *_label_columns("cluster"),
+DETECTION = _paper_columns("cluster")
+DETECTION_MORE: tuple[Column, ...] = (
     ("IoU of moving points (%)", "iou_moving", 2),
     ("movers found (%)", "movers_found", 2),
     *_counted("detection"),
+    *_more_columns("cluster"),
 )
 ESTIMATION: tuple[Column, ...] = (
     ("rotation (rad)", "motion_rotation", 4),
     ("translation (m)", "motion_translation", 3),
+)
+ESTIMATION_MORE: tuple[Column, ...] = (
     ("at centroid (m)", "motion_centroid", 3),
     ("objects", "motion_objects", 0),
     ("background rotation (rad)", "background_motion_rotation", 4),
@@ -99,59 +112,6 @@ SURENESS_NOTE = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Table:
-    """A table of numbers with a heading per column.
-
-    Attributes:
-        title: of the table.
-        columns: C headings.
-        rows: of C cells each, texts, numbers or differences with their intervals; NaN for missing values.
-        digits: digits after the point per column, for `to_markdown`; none given: 2.
-        note: explanation printed below the title.
-
-    Raises:
-        ValueError: a row or `digits` of another length than `columns`.
-    """
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    digits: tuple[int, ...] = ()
-    note: str = ""
-
-    def __post_init__(self) -> None:
-        for name, length in [*((f"row {i}", len(row)) for i, row in enumerate(self.rows)), ("digits", len(self.digits))]:
-            if length != len(self.columns) and not (name == "digits" and length == 0):
-                raise ValueError(f"{name}: expected {len(self.columns)} entries, one per column, got {length}")
-
-    def to_markdown(self) -> str:
-        """Title, note and a pipe table: numbers rounded and flush right, `-` for NaN, `*` at intervals that exclude zero."""
-        digits = self.digits or (2,) * len(self.columns)
-        cells = [[_rounded(cell, n) for cell, n in zip(row, digits, strict=True)] for row in self.rows]
-        rule = ["---" if is_text else "---:" for is_text in self._columns_with(str)]
-        lines = [[_escaped(column) for column in self.columns], rule, *cells]
-        above = "".join(f"{text}\n\n" for text in (f"**{_escaped(self.title)}**", self.note) if text)
-        return above + "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-    def to_csv(self) -> str:
-        """Headings and rows as comma-separated values with all digits, empty for NaN; title and note are left out.
-
-        A column of differences becomes three: itself, `<heading>, low` and `<heading>, high`.
-        """
-        wide = self._columns_with(Interval)
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        headings = (((name, f"{name}, low", f"{name}, high") if w else (name,)) for name, w in zip(self.columns, wide, strict=True))
-        writer.writerow([heading for group in headings for heading in group])
-        writer.writerows([field for cell, w in zip(row, wide, strict=True) for field in _fields(cell, w)] for row in self.rows)
-        return out.getvalue()
-
-    def _columns_with(self, kind: type) -> list[bool]:
-        """Whether each column has a cell of this kind."""
-        return [any(isinstance(row[i], kind) for row in self.rows) for i in range(len(self.columns))]
-
-
 Scores = Mapping[str, Sequence[PairScore]]
 
 
@@ -164,38 +124,50 @@ def overview_table(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | N
     table = _table("Overview", OVERVIEW, scores)
     if seconds is None:
         return table
-    times = {method: (1e3 * statistics.median(of_method),) for method, of_method in seconds.items() if len(of_method)}
-    return _widened(table, (("time (ms)", 0),), times)
+    times = {method: 1e3 * statistics.median(of_method) for method, of_method in seconds.items() if len(of_method)}
+    rows = tuple((*row, times.get(str(row[0]), math.nan)) for row in table.rows)
+    return replace(table, columns=(*table.columns, "time (ms)"), rows=rows, digits=(*table.digits, 0))
 
 
-def association_table(scores: Scores, *, published: bool = False) -> Table:
-    """The paper's Table I: data association. published: adds the paper's numbers.
+def paper_table(title: str, columns: Sequence[Column], scores: Scores, beside: paper.PublishedTable, weights: Ints | None) -> Table:
+    """One of the paper's tables, with 95 % intervals where there are resamples, each column beside the published one.
 
-    Raises:
-        ValueError: a method without scores.
-    """
-    table = _table("Table I: data association", ASSOCIATION, scores)
-    return _with_published(table, paper.ASSOCIATION) if published else table
+    The published columns are left out if they have none of the rows.
 
-
-def detection_table(scores: Scores, *, published: bool = False) -> Table:
-    """The paper's Table II: motion detection. published: adds the paper's numbers.
+    Args:
+        columns: the paper's. beside: its numbers, in the same columns. weights: (R, P) of `bootstrap.by_sequence` or `by_blocks`.
 
     Raises:
         ValueError: a method without scores.
     """
-    table = _table("Table II: motion detection", DETECTION, scores)
-    return _with_published(table, paper.DETECTION) if published else table
+    table = _table(title, columns, scores, weights)
+    if not any(method in beside.rows for method in scores):
+        return table
+    nothing: tuple[Cell, ...] = (math.nan,) * len(columns)
+    rows = [(row[0], *_alternating(row[1:], beside.rows.get(str(row[0]), nothing))) for row in table.rows]
+    published = [PUBLISHED_HEADING + heading for heading, _ in beside.columns]
+    headings = ("method", *_alternating(table.columns[1:], published))
+    digits = (0, *_alternating(table.digits[1:], [digits for _, digits in beside.columns]))
+    return Table(title, headings, tuple(rows), digits, PUBLISHED_NOTE)
 
 
-def estimation_table(scores: Scores, *, published: bool = False) -> Table:
-    """The paper's Table III: motion estimation, correctly clustered objects only. published: adds the paper's numbers.
+def _alternating(ours: Sequence[Any], theirs: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(one for both in zip(ours, theirs, strict=True) for one in both)
+
+
+def sequences_table(scores: Scores) -> Table:
+    """The overview of every sequence apart.
 
     Raises:
         ValueError: a method without scores.
     """
-    table = _table("Table III: motion estimation", ESTIMATION, scores)
-    return _with_published(table, paper.ESTIMATION) if published else table
+    rows: list[tuple[Cell, ...]] = []
+    for sequence in dict.fromkeys(one.sequence for of_method in scores.values() for one in of_method):
+        parts = {method: [one for one in of_method if one.sequence == sequence] for method, of_method in scores.items()}
+        for method, *cells in _table("", OVERVIEW, parts).rows:
+            rows.append((sequence, method, float(len(parts[str(method)])), *cells))
+    headings = ("sequence", "method", "pairs", *(heading for heading, _, _ in OVERVIEW))
+    return Table("By sequence", headings, tuple(rows), (0, 0, 0, *(digits for _, _, digits in OVERVIEW)))
 
 
 def sureness_table(scores: Scores) -> Table:
@@ -207,20 +179,29 @@ def sureness_table(scores: Scores) -> Table:
     return replace(_table("How sure", SURENESS, scores), note=SURENESS_NOTE)
 
 
-def report(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | None = None, published: bool = False) -> list[Table]:
-    """The overview, the Tables I, II, III and calibration, of `{method: its scores}`, methods in the given order.
+def report(
+    scores: Scores, *, seconds: Mapping[str, Sequence[float]] | None = None, published: bool = False, weights: Ints | None = None
+) -> list[Table]:
+    """The overview, the paper's Tables I, II, III, each with a table of more, and calibration, methods in the given order.
 
     Args:
         scores: of the pairs, by method.
         seconds: the time of every pair, by method, for the overview; `-` for a method that is missing.
-        published: adds the paper's numbers at the right of Tables I to III for rows that have some.
+        published: adds the paper's numbers.
+        weights: (R, P) resamples of the pairs, for intervals in the Tables I to III; None: none.
 
     Raises:
         ValueError: a method without scores.
     """
-    tables = (association_table, detection_table, estimation_table)
-    paper_tables = (table(scores, published=published) for table in tables)
-    return [overview_table(scores, seconds=seconds), *paper_tables, sureness_table(scores)]
+    tables = [overview_table(scores, seconds=seconds)]
+    for name, columns, more, numbers in (
+        ("Table I: data association", ASSOCIATION, ASSOCIATION_MORE, paper.ASSOCIATION),
+        ("Table II: motion detection", DETECTION, DETECTION_MORE, paper.DETECTION),
+        ("Table III: motion estimation", ESTIMATION, ESTIMATION_MORE, paper.ESTIMATION),
+    ):
+        beside = numbers if published else replace(numbers, rows={})
+        tables += [paper_table(name, columns, scores, beside, weights), _table(name.replace(":", ", more:"), more, scores)]
+    return [*tables, sureness_table(scores)]
 
 
 def differences_table(reference: str, scores: Scores, weights: Ints) -> Table:
@@ -239,65 +220,18 @@ def differences_table(reference: str, scores: Scores, weights: Ints) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for method, of_method in scores.items():
         if method != reference:
-            intervals = paired_intervals(scores[reference], of_method, weights)
-            rows.append((method, *(intervals[key] for _, key in DIFFERENCES)))
+            differences = paired_intervals(scores[reference], of_method, weights)
+            rows.append((method, *(differences[key] for _, key in DIFFERENCES)))
     headings = ("method", *(heading for heading, _ in DIFFERENCES))
     return Table(f"{reference} minus each row", headings, tuple(rows), (0, *[1] * len(DIFFERENCES)), DIFFERENCES_NOTE)
 
 
-def _table(title: str, columns: Sequence[Column], scores: Scores) -> Table:
+def _table(title: str, columns: Sequence[Column], scores: Scores, weights: Ints | None = None) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for method, of_method in scores.items():
         if not of_method:
             raise ValueError(f"scores: expected at least one pair for method {method!r}, got none")
-        summary = summarise(of_method)
+        summary: Mapping[str, Cell] = summarise(of_method) if weights is None else intervals(of_method, weights)
         rows.append((method, *(summary[key] for _, key, _ in columns)))
     headings = ("method", *(heading for heading, _, _ in columns))
     return Table(title, headings, tuple(rows), (0, *(digits for _, _, digits in columns)))
-
-
-def _with_published(table: Table, published: paper.PublishedTable) -> Table:
-    """The table with the paper's columns at the right, unchanged when no row has published numbers."""
-    if not any(row[0] in published.rows for row in table.rows):
-        return table
-    columns = [(PUBLISHED_HEADING + heading, digits) for heading, digits in published.columns]
-    return replace(_widened(table, columns, published.rows), note=PUBLISHED_NOTE)
-
-
-def _widened(table: Table, columns: Sequence[tuple[str, int]], cells: Mapping[str, tuple[float, ...]]) -> Table:
-    """The table with more columns (heading, digits) at the right: the cells of each row's method, NaN for missing ones."""
-    nothing = (math.nan,) * len(columns)
-    return replace(
-        table,
-        columns=(*table.columns, *(heading for heading, _ in columns)),
-        rows=tuple((*row, *cells.get(str(row[0]), nothing)) for row in table.rows),
-        digits=(*table.digits, *(digits for _, digits in columns)),
-    )
-
-
-def _fields(cell: Cell, is_wide: bool) -> tuple[str | float, ...]:
-    """The CSV fields of a cell, three in a column of differences."""
-    if isinstance(cell, Interval):
-        numbers: tuple[str | float, ...] = (cell.difference, cell.low, cell.high)
-    else:
-        numbers = (cell, "", "") if is_wide else (cell,)
-    return tuple("" if not isinstance(number, str) and math.isnan(number) else number for number in numbers)
-
-
-def _rounded(cell: Cell, digits: int) -> str:
-    if isinstance(cell, str):
-        return _escaped(cell)
-    if isinstance(cell, Interval):
-        low, high = _rounded(_signless_zero(cell.low, digits), digits), _rounded(_signless_zero(cell.high, digits), digits)
-        mark = " *" if cell.excludes_zero else ""
-        return f"{_signless_zero(cell.difference, digits):+.{digits}f} [{low}, {high}]{mark}"
-    return "-" if math.isnan(cell) else f"{cell:.{digits}f}"
-
-
-def _signless_zero(number: float, digits: int) -> float:
-    """The rounded number; a rounded zero has no minus sign, which would suggest a loss."""
-    return round(number, digits) + 0.0
-
-
-def _escaped(text: str) -> str:
-    return text.replace("|", "\\|")

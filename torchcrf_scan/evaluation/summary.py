@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from torchcrf_scan.evaluation.calibration import consistency, expected_calibration_error
 from torchcrf_scan.evaluation.measures import EVERY, Count
-from torchcrf_scan.evaluation.metrics import LabelScore, ObjectScore, PairScore
+from torchcrf_scan.evaluation.metrics import LabelScore, MotionError, ObjectScore, PairScore
 
 EGO_TRANSLATION, EGO_ROTATION = 0.05, 0.01745  # metres, radians (1 deg): success bounds of the ego motion
 EGO_TRANSLATION_LOOSE, EGO_ROTATION_LOOSE = 0.15, float(np.radians(0.5))  # for annotations accurate to about 7 cm
@@ -149,9 +149,14 @@ def _motion_summary(scores: Sequence[PairScore]) -> dict[str, float]:
     }
 
 
+def correct_errors(objects: Sequence[ObjectScore]) -> list[MotionError]:
+    """The motion errors of the correctly clustered objects."""
+    return [thing.error for thing in objects if thing.error is not None and thing.is_correct]
+
+
 def _error_summary(prefix: str, objects: Sequence[ObjectScore], is_meant: Callable[[ObjectScore], bool]) -> dict[str, float]:
     """Mean motion errors of the correctly clustered objects selected by `is_meant` (spec 8.5)."""
-    errors = [thing.error for thing in objects if thing.error is not None and thing.is_correct and is_meant(thing)]
+    errors = correct_errors([thing for thing in objects if is_meant(thing)])
     return {
         f"{prefix}_rotation": _mean(error.rotation for error in errors),
         f"{prefix}_translation": _mean(error.translation for error in errors),

@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 from torchcrf_scan.evaluation.bootstrap import paired_intervals
 from torchcrf_scan.evaluation.metrics import PairScore
-from torchcrf_scan.evaluation.report import DIFFERENCES, OVERVIEW, Cell, Table
+from torchcrf_scan.evaluation.report import DIFFERENCES, OVERVIEW
 from torchcrf_scan.evaluation.summary import summarise
+from torchcrf_scan.evaluation.table import Cell, Table
 from torchcrf_scan.scan import Ints
 
 NOTE = "Differences: variant minus model, percentage points on the same pairs [95 % interval]; * where it excludes zero."

@@ -18,8 +18,9 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import NAMED_WORLDS
 from torchcrf_scan.evaluation.bootstrap import by_blocks, by_sequence
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
-from torchcrf_scan.evaluation.report import Scores, Table, differences_table, report
+from torchcrf_scan.evaluation.report import Scores, differences_table, report, sequences_table
 from torchcrf_scan.evaluation.summary import summarise
+from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.experiment.ablation import ablation_table
 from torchcrf_scan.experiment.cross_validation import Results, cores, file_name, make_folds, rank_and_world, read_folds, run_folds
 from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT
@@ -27,7 +28,8 @@ from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning.run_log import RunLog
 from torchcrf_scan.scan import Ints, PairPrediction, ScanPair
-from torchcrf_scan.viz.plots import plot_associations, plot_clusters, save_figure
+from torchcrf_scan.viz.plots import plot_associations, save_figure
+from torchcrf_scan.viz.sequences import consecutive, plot_association_sequence, plot_cluster_sequence
 from torchcrf_scan.whole_file import write_whole
 
 log = logging.getLogger(__name__)
@@ -37,6 +39,8 @@ ALSO_TRAIN_SEED = 5_000  # of the worlds that every fold trains on, far from tho
 ASSOCIATION_FIGURE = ("ICP, tuned", "CRF-Matching", "start + gated NN", JOINT)  # the paper's Fig. 3, and the start
 CLUSTER_FIGURE = ("K-Means (ICP)", "K-Means (CRF-Matching)", "CRF-Clustering", JOINT)  # the paper's Fig. 4
 RIVAL = "start + gated NN"
+APART = ("CRF-Matching", RIVAL, JOINT, ENCODED)  # rows of the table by sequence
+SEQUENTIAL = 4  # scans of such a figure, as in the paper
 DRAWN = 3  # sequences whose first pair is drawn by default
 LOSSES = 3  # number of pictures of pairs where the joint model loses most against its start
 ABLATED = "leave_one_sequence_out"
@@ -218,9 +222,10 @@ def resample(scores: Sequence[PairScore], config: RunConfig) -> Ints:
 
 
 def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: str, config: RunConfig, run: RunLog) -> list[Table]:
-    """Overview, Tables I to III, calibration and differences of one protocol, logged as well."""
-    tables = report(scores, seconds=seconds, published=True)
+    """Overview, by sequence too, Tables I to III, calibration and differences of one protocol, logged as well."""
     weights = resample(scores[JOINT], config)
+    tables = report(scores, seconds=seconds, published=True, weights=weights)
+    tables.insert(1, sequences_table({name: scores[name] for name in APART if name in scores}))
     tables += [differences_table(name, scores, weights) for name in (JOINT, ENCODED, EXACT) if name in scores and len(scores) > 1]
     tables = [replace(table, title=f"{table.title} ({protocol.replace('_', ' ')})") for table in tables]
     for table in tables:
@@ -234,22 +239,24 @@ def draw(results: Results, scores: Scores, pairs: Sequence[ScanPair], folder: Pa
     """The paper's Figures 3 and 4 of the chosen pairs, and the pairs where the joint model loses most against its start."""
     index = {pair.name: k for k, pair in enumerate(results.pairs)}
 
-    def answers(methods: Sequence[str], k: int) -> dict[str, PairPrediction]:
-        return {method: results.predictions[method][k] for method in methods if method in results.predictions}
+    def answers(methods: Sequence[str], numbers: Sequence[int]) -> dict[str, list[PairPrediction]]:
+        return {method: [results.predictions[method][k] for k in numbers] for method in methods if method in results.predictions}
 
     for pair in pairs:
         if pair.name in index:
-            k = index[pair.name]
+            numbers = consecutive(results.pairs, index[pair.name], SEQUENTIAL - 1)
+            chosen = [results.pairs[k] for k in numbers]
             figures = {
-                "associations": plot_associations(pair, answers(ASSOCIATION_FIGURE, k)),
-                "clusters": plot_clusters(pair, answers(CLUSTER_FIGURE, k)),
+                "associations": plot_association_sequence(chosen, answers(ASSOCIATION_FIGURE, numbers)),
+                "clusters": plot_cluster_sequence(chosen, answers(CLUSTER_FIGURE, numbers)),
             }
             for kind, figure in figures.items():
                 save_figure(figure, folder / f"{kind}_{file_name(pair.name)}.png")
                 run.figure(f"{folder.name}/{kind}/{pair.name}", figure)
     if RIVAL in results.predictions:
         for k in worst_pairs(scores):
-            figure = plot_associations(results.pairs[k], answers((RIVAL, JOINT), k))
+            both = {method: results.predictions[method][k] for method in (RIVAL, JOINT)}
+            figure = plot_associations(results.pairs[k], both)
             save_figure(figure, folder / f"loss_{file_name(results.pairs[k].name)}.png")
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-from torchcrf_scan.evaluation.report import Table
+from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.scan import PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_pair, save_figure

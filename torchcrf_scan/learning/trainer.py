@@ -25,8 +25,9 @@ from torchcrf_scan.data.dataset import PairFiles, split_by_sequence
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import NAMED_WORLDS
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
-from torchcrf_scan.evaluation.report import Table, report
+from torchcrf_scan.evaluation.report import report
 from torchcrf_scan.evaluation.summary import summarise
+from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.cascade_fit import fit_cascade

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers
-from torchcrf_scan.scan import BACKGROUND, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
+from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 
 ASSOCIATION_TOLERANCE = 2  # beams; associations within this distance are drawn as right
 
@@ -85,13 +85,26 @@ def judge(name: str, drawn: Labels, pair: ScanPair, guess: Labels, truth: Labels
     return Answer(name, drawn, known & ~near, known & (guess.cluster != truth.cluster))
 
 
-def all_answers(pair: ScanPair, predictions: Mapping[str, PairPrediction]) -> list[Answer]:
-    """The methods' labels in their order, then the true ones; raises ValueError if there are none."""
+def all_answers(pair: ScanPair, predictions: Mapping[str, PairPrediction], before: Labels | None = None) -> list[Answer]:
+    """The methods' labels in their order, then the true ones; raises ValueError if there are none.
+
+    before: true labels that the pair's are numbered after, see `carried_on`; None: numbers of the annotation.
+    """
     truth = true_labels(pair)
     if truth is None and not predictions:
         raise ValueError("predictions: expected at least one method for a pair without annotation, got none")
+    if truth is not None and before is not None:
+        truth = _renumber(truth, before)
     answers = []
     for name, prediction in predictions.items():
         guess = predicted_labels(pair, name, prediction, truth)
         answers.append(Answer(name, guess) if truth is None else judge(name, guess, pair, guess, truth))
     return answers if truth is None else [*answers, Answer("truth", truth)]
+
+
+def carried_on(labels: Labels, pair: ScanPair) -> Labels:
+    """The labels by target beam, as the associations carry them: those that the next pair's source should get."""
+    associated = labels.association >= 0
+    cluster = np.full(pair.target.n_beams, OUTLIER, dtype=labels.cluster.dtype)
+    cluster[labels.association[associated]] = labels.cluster[associated]
+    return Labels(np.full_like(cluster, OUTLIER), cluster, labels.motions)

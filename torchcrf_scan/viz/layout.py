@@ -64,10 +64,11 @@ def _width(text: Text) -> float:
     return float(text.get_window_extent().width / text.figure.dpi)
 
 
-def finish(figure: Figure, pair: ScanPair) -> Figure:
-    """Adds the pair's name and one legend for all panels."""
+def finish(figure: Figure, pair: ScanPair, scans: int = 2) -> Figure:
+    """Adds the pair's name and one legend for all panels. scans: consecutive ones, of which the pair's are the first."""
     name = pair.name or pair.sequence or "scan pair"
-    counts = f"{len(pair.source)} and {len(pair.target)} returns, {pair.dt:.3g} s apart; x ahead, y left, metres"
+    what = f"{len(pair.source)} and {len(pair.target)} returns" if scans == 2 else f"{scans} scans from here on"
+    counts = f"{what}, {pair.dt:.3g} s apart; x ahead, y left, metres"
     figure.suptitle(f"{drawable(name)}: {counts}", x=0.008, ha="left", fontsize=11.5, color=INK, parse_math=False)
     entries: dict[str, Artist] = {}
     for ax in figure.axes:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,11 +35,33 @@ def make_scene(pair: ScanPair, answers: list[Labels]) -> Scene:
     faint = np.zeros(len(source), dtype=bool) if pair.annotation is None else np.asarray(pair.annotation.ignore)
     centroids = [_centroid(source, labels.cluster == k) for labels in answers[:1] for k in labels.movers]
     window = _robust_window(np.concatenate([source, target]), np.reshape(centroids, (-1, 2)))
-    zooms = (_zoom_window(source, target, labels, window) for labels in answers)
-    zoom = next((zoom for zoom in zooms if zoom is not None), None)
     speeds = [[float(np.hypot(*v)) for _, v in mover_velocities(source, pair.dt, labels).values()] for labels in answers]
     seconds = _horizon([max(fastest) for fastest in speeds if fastest], window)
-    return Scene(source, target, pair.dt, faint, window, zoom, seconds)
+    scene = Scene(source, target, pair.dt, faint, window, None, seconds)
+    zooms = (zoom_on([(scene, labels)]) for labels in answers)
+    return replace(scene, zoom=next((zoom for zoom in zooms if zoom is not None), None))
+
+
+def join_windows(windows: Sequence[Window]) -> Window:
+    """The smallest window around all of them, of an aspect between 0.85 and 1.4."""
+    low, high = np.min([window[0] for window in windows], axis=0), np.max([window[1] for window in windows], axis=0)
+    return _box((low + high) / 2, _within_aspect(high - low))
+
+
+def zoom_on(steps: Sequence[tuple[Scene, Labels]]) -> Window | None:
+    """A window of the aspect of the first scene's around one mover in all scans: the largest of the first pair that has one."""
+    for scene, labels in steps:
+        sizes = {k: int((np.isfinite(scene.source[:, 0]) & (labels.cluster == k)).sum()) for k in labels.movers.tolist()}
+        if sizes and max(sizes.values()):
+            mover = max(sizes, key=lambda k: sizes[k])
+            break
+    else:
+        return None
+    points = []
+    for scene, labels in steps:
+        mask = labels.cluster == mover
+        points += [scene.source[mask], scene.target[labels.association[mask & (labels.association >= 0)]]]
+    return _around(np.concatenate(points), steps[0][0].window)
 
 
 def mover_velocities(source: Floats, dt: float, labels: Labels) -> dict[int, tuple[Floats, Floats]]:
@@ -71,22 +94,19 @@ def _robust_window(points: Floats, always: Floats) -> Window:
     bulk = np.percentile(points, (2, 98), axis=0) if len(points) else np.zeros((1, 2))
     corners = np.concatenate([bulk, always, np.zeros((1, 2))])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    size = np.maximum(1.16 * (high - low), max(0.1 * float((high - low).max()), 0.5))
-    size = np.maximum(size, [0.85 * size[1], size[0] / 1.4])
-    return _box((low + high) / 2, size)
+    return _box((low + high) / 2, _within_aspect(np.maximum(1.16 * (high - low), max(0.1 * float((high - low).max()), 0.5))))
 
 
-def _zoom_window(source: Floats, target: Floats, labels: Labels, window: Window) -> Window | None:
-    """A window of the same aspect around the largest mover in both scans, None if nothing moves."""
-    sizes = {int(k): int((np.isfinite(source[:, 0]) & (labels.cluster == k)).sum()) for k in labels.movers}
-    if not sizes or max(sizes.values()) == 0:
-        return None
-    mask = labels.cluster == max(sizes, key=lambda k: sizes[k])
-    points = np.concatenate([source[mask], target[labels.association[mask & (labels.association >= 0)]]])
+def _within_aspect(size: Floats) -> Floats:
+    """(2,) the smallest size around this one of an aspect between 0.85 and 1.4."""
+    return np.maximum(size, [0.85 * size[1], size[0] / 1.4])
+
+
+def _around(points: Floats, window: Window) -> Window:
+    """A window of the same aspect around points."""
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     full = window[1] - window[0]
-    scale = float(np.clip((1.35 * (high - low) / full).max(), 0.03, 1.0))
-    return _box((low + high) / 2, scale * full)
+    return _box((low + high) / 2, float(np.clip((1.35 * (high - low) / full).max(), 0.03, 1.0)) * full)
 
 
 def _box(centre: Floats, size: Floats) -> Window:

@@ -9,7 +9,7 @@ from typing import Any
 from torchcrf_scan.evaluation.causes.blame import CAUSES, Blame
 from torchcrf_scan.evaluation.causes.movers import FALSE_KINDS, FATES
 from torchcrf_scan.evaluation.causes.outliers import Gate, OutlierCase, best_gate
-from torchcrf_scan.evaluation.report import Cell, Table
+from torchcrf_scan.evaluation.table import Cell, Table
 
 MOST_SEQUENCES = 6  # with columns of their own
 CAUSES_NOTE = (
