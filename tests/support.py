@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# Where the paper's weights are among all; between them stand the extensions' (`features.scales`).
+# Where the weights of the paper's features are among all; between them stand the extensions' (`features.scales`).
 PAPER_ASSOCIATION = [*range(14), *range(19, 23)]
 PAPER_CLUSTERING = [*range(4), *range(13, 21)]
 PAPER_WEIGHTS = [*PAPER_ASSOCIATION, *(23 + k for k in PAPER_CLUSTERING)]  # of both chains in a row
@@ -39,7 +39,7 @@ def extended(weights: Tensor) -> Tensor:
 
 
 def paper_weights(association_seed: int, clustering_seed: int) -> tuple[Tensor, Tensor]:
-    """(23,) and (21,): random weights of the paper's features, none of the extensions'."""
+    """(23,) and (21,): random weights of the features after the paper, none of the extensions'."""
     return extended(normal(18, seed=association_seed)), extended(normal(12, seed=clustering_seed))
 
 

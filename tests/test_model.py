@@ -105,7 +105,7 @@ def assert_equal(found: PairPrediction, expected: PairPrediction) -> None:
 # --- weights ------------------------------------------------------------------------------------------------------------------
 
 
-def test_thirty_named_weights_in_the_papers_order() -> None:
+def test_thirty_named_weights_in_the_order_of_the_specification() -> None:
     model = JointScanCRF(ModelConfig(features=PAPER))
     assert tuple(ASSOCIATION_WEIGHTS[k] for k in PAPER_ASSOCIATION) == ASSOCIATION
     assert tuple(CLUSTERING_WEIGHTS[k] for k in PAPER_CLUSTERING) == CLUSTERING

@@ -90,7 +90,7 @@ class FeatureConfig:
     Attributes:
         free_space: free-space and occlusion features, as extension weights of both chains (design finding 13).
         decisions: features for the inlier/outlier decision and for the nearest target point, as extension weights of both chains:
-            a gate on the residual, a constant, the excess over the nearest. This and `free_space` off: the paper's 30.
+            a gate on the residual, a constant, the excess over the nearest. This and `free_space` off: 30.
         reach: how a point's distance from the segment that a mover was found by (`Start.reach`) bears on its cluster: `soft`, an
             extension weight of the clustering chain; `hard`, a mover is impossible beyond the segment's reach; `off` (in YAML with
             quotes), not at all.

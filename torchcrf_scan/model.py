@@ -50,10 +50,11 @@ BothEmbeddings = tuple[Tensor | None, Tensor | None]  # of source and target
 class JointScanCRF(nn.Module):
     """Data association, clustering and motions of B scan pairs by a log-linear conditional random field.
 
-    Parameters: one named weight per feature. The paper has thirty, 18 of the association chain and 12 of the clustering chain
-    (spec 5.1); enabled extensions (`FeatureConfig`) and embeddings (`features.learned`) add theirs. Buffers: boosters, scales
-    of the features and the score of hypothesised movers, which are fitted before the weights (`torchcrf_scan.learning`); with
-    `features.learn_stumps` the boosters are parameters. With `encoder` a `ScanEncoder` adds log potentials and embeddings.
+    Parameters: one named weight per feature. Thirty are of the features that the paper describes, 18 of the association chain and
+    12 of the clustering chain: as many as it counts, but which they are is a reconstruction (spec 5.2). Enabled extensions
+    (`FeatureConfig`) and embeddings (`features.learned`) add theirs. Buffers: boosters, scales of the features and the score of
+    hypothesised movers, which are fitted before the weights (`torchcrf_scan.learning`); with `features.learn_stumps` the boosters
+    are parameters. With `encoder` a `ScanEncoder` adds log potentials and embeddings.
 
     Gradients: log-beliefs are differentiable in the weights, the points and the optional inputs of `forward`, and so are the
     motions with `inference.motion_weights = soft`; at fixed candidates and away from kinks (ties, clipped errors). Labels, start,

@@ -1,4 +1,4 @@
-"""Features in addition to the paper's thirty: `features.decisions`, `features.free_space`, `features.reach`.
+"""Features in addition to the thirty that the paper describes: `features.decisions`, `features.free_space`, `features.reach`.
 
 Robust squares do not set a distance limit for inliers, so there are a gate and a constant; nor do they prefer the nearest of
 several points enough. A point in the free space of the other scan under a motion does not move so (design finding 13), and a

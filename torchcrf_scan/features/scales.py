@@ -42,7 +42,7 @@ def live_weights(config: FeatureConfig) -> tuple[Tensor, Tensor]:
 
 
 def has_weight(config: FeatureConfig, name: str) -> bool:
-    """Whether a model has the parameter `association.NAME` or `clustering.NAME`: the paper's 30 always, extensions if enabled."""
+    """Whether a model has the parameter `association.NAME` or `clustering.NAME`: thirty always (spec 5.1), others if enabled."""
     is_on = (config.free_space or name not in FREE_SPACE_WEIGHTS) and (config.decisions or name not in DECISION_WEIGHTS)
     return is_on and (config.reach == "soft" or name != REACH_WEIGHT)
 
