@@ -31,6 +31,7 @@ from torchcrf_scan.inference.pseudo_likelihood import (
     Design,
     PlugIns,
     association_chain,
+    association_design,
     at_true_neighbours,
     clustering_chain,
     for_background_alone,
@@ -102,6 +103,20 @@ def conditionals(unary: np.ndarray, pairwise: np.ndarray, labels: list[int], wei
             rows.append(np.concatenate([unary[i, state], edge]))
         out.append(log_conditional(np.array(rows), weights, label))
     return out
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_edges_to_true_neighbours_alone_give_the_same_design(seed: int) -> None:
+    """Fewer transitions are calculated, and not one number changes; also with few candidates, outliers and unknown points."""
+    batch, scales, boosters = tiny(seed), Scales().double(), Boosters(7).double()
+    plugins = plugins_of(batch)
+    plugins = replace(plugins, known=plugins.known & (torch.arange(plugins.known.shape[1]) != 1 + seed % 3))
+    for config in (DENSE, replace(DENSE, candidates=2)):
+        for has_lengths in (True, False):
+            inputs = (replace(PairView.of(batch), has_lengths=has_lengths), plugins, scales, boosters, config)
+            expected, found = association_chain(*inputs).design(), association_design(*inputs)
+            for name in ("features", "mask", "label", "known"):
+                assert torch.equal(getattr(found, name), getattr(expected, name)), name
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -18,7 +18,7 @@ from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.features.potentials import Boosters, PairView
 from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.pseudo_likelihood import Chain, PlugIns
+from torchcrf_scan.inference.pseudo_likelihood import Chain, PlugIns, association_design
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.learning import cascade_fit
 from torchcrf_scan.learning import fit as of_fit
@@ -179,10 +179,13 @@ def test_margins_are_those_of_the_folds_own_boosters(
     column = ASSOCIATION_NODE.index("data_boosting")
     lessons = lessons_of(model, material, replace(small_config, learning=learning))
     for chain, lesson in zip(learned[0], lessons, strict=True):
-        expected = of_fit.association_chain(model, lesson, margins[lesson.fold])
-        seen = of_fit.association_chain(model, lesson, model.boosters)
-        assert torch.equal(chain.unary[..., column], expected.unary[..., column])
-        assert not torch.equal(chain.unary[..., column], seen.unary[..., column])
+        expected, seen = (
+            association_design(lesson.view, lesson.plugins, model.scales, boosters, model.config.inference)
+            for boosters in (margins[lesson.fold], model.boosters)
+        )
+        found = chain.design().features[..., column]
+        assert torch.equal(found, expected.features[..., column])
+        assert not torch.equal(found, seen.features[..., column])
 
 
 def test_crf_clustering_is_fed_by_boosters_without_the_fold(

@@ -107,23 +107,39 @@ def pairwise_features(
     Returns:
         (B, N-1, K+1, K+1, 4); the last state is the outlier. Costs N K^2.
     """
-    index_step = candidates[:, 1:, None, :] - candidates[:, :-1, :, None]  # (B, N-1, K, K)
+    before, after = candidates[:, :-1], candidates[:, 1:]
+    return edge_features(source_points, target_points, before, after, scales, has_lengths=has_lengths)
+
+
+def edge_features(
+    source_points: Tensor, target_points: Tensor, before: Tensor, after: Tensor, scales: Scales, *, has_lengths: bool = True
+) -> Tensor:
+    """P1..P4 of every edge (i, i+1) for some states of its two points; otherwise as `pairwise_features`.
+
+    Args:
+        before, after: (B, N-1, K) and (B, N-1, L) target points of the edge's first and second point.
+
+    Returns:
+        (B, N-1, K+1, L+1, 4); the last states are the outlier.
+    """
+    index_step = after[:, :, None, :] - before[:, :, :, None]  # (B, N-1, K, L)
     in_sequence = (index_step == 1).to(source_points.dtype)
     inliers = torch.stack([in_sequence, *[torch.zeros_like(in_sequence)] * 3], dim=-1)
     if has_lengths:
-        lengths = length_features(source_points, gather_points(target_points, candidates), scales)
+        partners = gather_points(target_points, before), gather_points(target_points, after)
+        lengths = length_features(source_points, *partners, scales)
         inliers = torch.cat([inliers[..., :2], lengths], dim=-1)
     switch = torch.cat([scales.pairwise_outlier.new_tensor([0.0, 1.0]), scales.pairwise_outlier])
     stay = torch.cat([scales.pairwise_outlier.new_zeros(2), scales.pairwise_outlier])
-    B, E, K = inliers.shape[:3]
+    B, E, K, L = inliers.shape[:4]
     rows = torch.cat([inliers, switch.expand(B, E, K, 1, 4)], dim=3)
-    last = torch.cat([switch.expand(B, E, 1, K, 4), stay.expand(B, E, 1, 1, 4)], dim=3)
+    last = torch.cat([switch.expand(B, E, 1, L, 4), stay.expand(B, E, 1, 1, 4)], dim=3)
     return torch.cat([rows, last], dim=2)
 
 
-def length_features(source_points: Tensor, partner: Tensor, scales: Scales) -> Tensor:
-    """(B, N-1, K, K, 2) P3 and P4 of two inliers. partner: (B, N, K, 2) the candidates' points."""
-    v2 = partner[:, 1:, None, :] - partner[:, :-1, :, None]  # (B, N-1, K, K, 2)
+def length_features(source_points: Tensor, before: Tensor, after: Tensor, scales: Scales) -> Tensor:
+    """(B, N-1, K, L, 2) P3 and P4 of two inliers. before, after: (B, N-1, K, 2), (B, N-1, L, 2) target points of an edge's ends."""
+    v2 = after[:, :, None, :] - before[:, :, :, None]  # (B, N-1, K, L, 2)
     v1 = (source_points[:, 1:] - source_points[:, :-1])[:, :, None, None]  # (B, N-1, 1, 1, 2)
     d1, d2 = torch.linalg.vector_norm(v1, dim=-1), torch.linalg.vector_norm(v2, dim=-1)
     shift = torch.linalg.vector_norm(v1 - v2, dim=-1)

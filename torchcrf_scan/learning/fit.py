@@ -18,6 +18,7 @@ from torchcrf_scan.inference import joint, pseudo_likelihood
 from torchcrf_scan.inference.pseudo_likelihood import Chain, PlugIns
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.boosting_fit import fit_boosters
+from torchcrf_scan.learning.losses import LOSSES
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.learning.plugins import mix_associations, training_plugins
 from torchcrf_scan.learning.scales_fit import fit_scales
@@ -103,7 +104,8 @@ def fit_association(
     model: JointScanCRF, lessons: Sequence[Lesson], margins: Margins, config: LearningConfig, watch: Watch | None
 ) -> None:
     """Fits the weights of the association chain, with out-of-fold margins."""
-    features = (association_chain(model, lesson, margins[lesson.fold]) for lesson in lessons)
+    make = pseudo_likelihood.association_chain if LOSSES[config.objective].is_exact else pseudo_likelihood.association_design
+    features = (make(of.view, of.plugins, model.scales, margins[of.fold], model.config.inference) for of in lessons)
     set_weights(model, "association", fit_chain(features, live_weights(model.config.features)[0], config, watch))
 
 
@@ -157,11 +159,6 @@ def fit_all_boosters(model: JointScanCRF, lessons: Sequence[Lesson], config: Lea
     if len(numbers) == 1:
         return {numbers[0]: everything}
     return {number: fit_on(part) for number, part in tqdm(jobs.items(), desc="boosters", unit="fold", leave=False)}
-
-
-def association_chain(model: JointScanCRF, lesson: Lesson, margins: Boosters) -> Chain:
-    """The lesson's association features with out-of-fold margins."""
-    return pseudo_likelihood.association_chain(lesson.view, lesson.plugins, model.scales, margins, model.config.inference)
 
 
 @torch.no_grad()
