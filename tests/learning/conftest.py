@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 from matplotlib.figure import Figure
+from tensorboard.summary.writer import event_file_writer
 from torch.utils.tensorboard import SummaryWriter
 
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
@@ -14,6 +15,12 @@ from torchcrf_scan.experiment.settings import ExperimentConfig, RunConfig
 from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.scan import ScanPair
+
+
+@pytest.fixture
+def event_files_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Writers of one second sort by a counter of the process, read as text: 10 comes before 9, so it begins at 0."""
+    monkeypatch.setattr(event_file_writer, "_global_uid", event_file_writer.AtomicCounter(0))
 
 
 @pytest.fixture(scope="session")

@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-import pytest
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
 
 from torchcrf_scan.evaluation.table import Table
-from torchcrf_scan.learning.run_log import RunLog
+from torchcrf_scan.learning.run_log import WATCHED, RunLog
 
 
 def read(folder: Path) -> EventAccumulator:
@@ -17,14 +16,20 @@ def read(folder: Path) -> EventAccumulator:
     return events
 
 
-def test_a_table_is_text_under_its_title(tmp_path: Path) -> None:
+def test_tables_are_one_text(tmp_path: Path) -> None:
     table = Table("Table I: data association", ("method", "accuracy (%)"), (("joint", 74.1), ("ICP", float("nan"))))
     with RunLog(tmp_path) as log:
-        log.table(table)
-        log.table(table, step=3)
-    events = read(tmp_path).Tensors("tables/Table I: data association/text_summary")
-    assert [event.step for event in events] == [0, 3]
-    assert events[0].tensor_proto.string_val[0].decode() == table.to_markdown()
+        log.tables("final", [table, table])
+    (event,) = read(tmp_path).Tensors("final/text_summary")
+    assert event.tensor_proto.string_val[0].decode() == f"{table.to_markdown()}\n\n{table.to_markdown()}"
+
+
+def test_another_run_in_the_folder_hides_the_one_before(tmp_path: Path, event_files_in_order: None) -> None:
+    for values in ((1.0, 2.0, 3.0), (10.0, 20.0)):
+        with RunLog(tmp_path) as log:
+            for step, value in enumerate(values, 1):
+                log.objective("joint/association", step, value, value)
+    assert [event.value for event in read(tmp_path).Scalars("objective/joint/association")] == [10.0, 20.0]
 
 
 def test_a_figure_is_an_event_and_no_file(tmp_path: Path) -> None:
@@ -39,20 +44,13 @@ def test_a_figure_is_an_event_and_no_file(tmp_path: Path) -> None:
     assert figure.axes, "the figure is still open"
 
 
-def test_only_numbers_of_a_summary_are_scalars(tmp_path: Path) -> None:
+def test_settings_of_a_staged_run_stand_beside_its_last_figures(tmp_path: Path) -> None:
     with RunLog(tmp_path) as log:
-        log.metrics("joint", {"cluster_accuracy": 83.0, "target_distance": float("nan")}, step=1)
-    events = read(tmp_path)
-    assert events.Tags()["scalars"] == ["test/cluster_accuracy/joint"]
-    assert events.Scalars("test/cluster_accuracy/joint")[0].value == pytest.approx(83.0)
-
-
-def test_settings_of_a_staged_run_stand_beside_what_came_of_it(tmp_path: Path) -> None:
-    with RunLog(tmp_path) as log:
-        log.settings({"learning.prior": 10.0, "data.simulate_train": ("street",)}, {"cluster_accuracy": 83.0})
+        log.curves("joint", dict.fromkeys(WATCHED, 83.0), step=1)
+        log.settings({"learning.prior": 10.0, "data.simulate_train": ("street",)}, ["accuracy/cluster_accuracy/joint"])
     events = read(tmp_path)
     data = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
     settings = plugin_data_pb2.HParamsPluginData.FromString(data).session_start_info.hparams
     assert settings["learning.prior"].number_value == 10.0
     assert settings["data.simulate_train"].string_value == "('street',)"
-    assert events.Scalars("final/cluster_accuracy")[0].value == pytest.approx(83.0)
+    assert sorted(events.Tags()["scalars"]) == sorted(f"accuracy/{name}/joint" for name in WATCHED)  # none but the curves

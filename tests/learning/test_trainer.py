@@ -2,13 +2,17 @@
 
 import importlib.util
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.custom_scalar import layout_pb2
+from tensorboard.plugins.hparams import plugin_data_pb2
 
+from torchcrf_scan.learning.run_log import WATCHED
 from torchcrf_scan.learning.settings import DataConfig
 from torchcrf_scan.learning.trainer import load_data, pairs_to_draw, refuse_leaks, versions
 from torchcrf_scan.model import JointScanCRF
@@ -39,7 +43,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, drawn_once: None) -> Path:
 
 @pytest.fixture(scope="module")
 def events(run: Path) -> EventAccumulator:
-    accumulator = EventAccumulator(str(run / "events"), size_guidance={"scalars": 0, "images": 0})
+    accumulator = EventAccumulator(str(run / "events"), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
     accumulator.Reload()
     return accumulator
 
@@ -104,24 +108,61 @@ def test_every_step_of_the_fit_is_logged(events: EventAccumulator, tag: str) -> 
     assert len(losses) > 1
     assert losses[-1] < losses[0]
     assert len(events.Scalars(f"gradient/{tag}")) == len(losses)
-    names = ASSOCIATION_WEIGHTS if tag.endswith("association") else CLUSTERING_WEIGHTS
-    assert all(len(events.Scalars(f"weights/{tag}/{name}")) == len(losses) for name in names)
 
 
-def test_the_last_logged_weights_are_the_models(run: Path, events: EventAccumulator) -> None:
+@pytest.mark.parametrize(("chain", "names"), [("association", ASSOCIATION_WEIGHTS), ("clustering", CLUSTERING_WEIGHTS)])
+def test_weights_of_every_step_are_logged(run: Path, events: EventAccumulator, chain: str, names: tuple[str, ...]) -> None:
+    """Those of the joint model, the last ones as saved."""
     model = JointScanCRF.from_pretrained(run / "model")
-    for name in ASSOCIATION_WEIGHTS:
-        logged = events.Scalars(f"weights/joint/association/{name}")[-1].value
-        assert logged == pytest.approx(model.association_weights[name].item(), rel=1e-4, abs=1e-5), name
+    saved = {"association": model.association_weights, "clustering": model.clustering_weights}[chain]
+    for name in names:
+        logged = [event.value for event in events.Scalars(f"weights/{chain}/{name}")]
+        assert len(logged) == len(events.Scalars(f"objective/joint/{chain}"))
+        assert logged[-1] == pytest.approx(saved[name].item() if name in saved else 0.0, rel=1e-4, abs=1e-5), name
 
 
-def test_metrics_and_pictures_are_logged(run: Path, events: EventAccumulator) -> None:
-    metrics = json.loads((run / "metrics.json").read_text())
-    for method in METHODS:
-        for name in ("association_accuracy", "cluster_accuracy", "ego_success"):
-            logged = events.Scalars(f"test/{name}/{method}")[0].value
-            assert logged == pytest.approx(metrics[method][name], rel=1e-4)
-    assert len(events.Images("pair")) == 3
+def test_the_fit_is_seen_to_learn(run: Path, events: EventAccumulator) -> None:
+    """Curves of the accuracy from the first step to the fitted model, whose figures on the few test pairs are the final ones."""
+    metrics = json.loads((run / "metrics.json").read_text())["joint"]
+    for name in WATCHED:
+        curve = [event.value for event in events.Scalars(f"accuracy/{name}/joint")]
+        assert len(curve) >= 3
+        assert curve[-1] == pytest.approx(metrics[name], rel=1e-4)
+        assert len({event.value for event in events.Scalars(f"accuracy/{name}/start + gated NN")}) == 1
+    exact = [event.value for event in events.Scalars("accuracy/association_accuracy/joint")]
+    assert exact[-1] > exact[0]
+
+
+def test_every_card_is_a_curve(events: EventAccumulator) -> None:
+    """What one opens first is what one watches: no card has a single point, no figure is in two places, pictures are by pair."""
+    scalars = events.Tags()["scalars"]
+    assert all(len(events.Scalars(tag)) > 1 for tag in scalars)
+    assert [*dict.fromkeys(tag.split("/")[0] for tag in sorted(scalars))] == ["accuracy", "gradient", "objective", "weights"]
+    assert len([tag for tag in scalars if not tag.startswith("weights/")]) == 2 * len(WATCHED) + 2 * 4
+    for tag in (tag for tag in events.Tags()["images"]):
+        before, after = events.Images(tag)
+        assert before.step == 0 < after.step
+        assert tag.startswith("pair/")
+    assert len(events.Tags()["images"]) == 3
+
+
+def test_weights_are_one_chart_a_chain(events: EventAccumulator) -> None:
+    (event,) = events.Tensors("custom_scalars__config__")
+    layout = layout_pb2.Layout.FromString(event.tensor_proto.string_val[0])
+    charts = {chart.title: list(chart.multiline.tag) for category in layout.category for chart in category.chart}
+    assert layout.category[0].title == "what one watches"
+    for chain in ("association", "clustering"):
+        (pattern,) = charts[chain]
+        lines = [tag for tag in events.Tags()["scalars"] if re.fullmatch(pattern, tag)]
+        assert len(lines) == len({"association": ASSOCIATION_WEIGHTS, "clustering": CLUSTERING_WEIGHTS}[chain])
+
+
+def test_final_numbers_are_one_text_and_in_hparams(run: Path, events: EventAccumulator) -> None:
+    (text,) = events.Tensors("final/text_summary")
+    assert text.tensor_proto.string_val[0].decode().strip() == (run / "tables.md").read_text().strip()
+    content = events.SummaryMetadata("_hparams_/experiment").plugin_data.content
+    found = plugin_data_pb2.HParamsPluginData.FromString(content).experiment.metric_infos
+    assert [metric.name.tag for metric in found] == [f"accuracy/{name}/joint" for name in WATCHED]
 
 
 def named(*sequences: str) -> list[ScanPair]:

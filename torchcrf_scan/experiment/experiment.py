@@ -19,7 +19,6 @@ from torchcrf_scan.data.worlds import NAMED_WORLDS
 from torchcrf_scan.evaluation.bootstrap import by_blocks, by_sequence
 from torchcrf_scan.evaluation.metrics import PairScore, score_pair
 from torchcrf_scan.evaluation.report import Scores, differences_table, report, sequences_table
-from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.experiment.ablation import ablation_table
 from torchcrf_scan.experiment.cross_validation import Results, cores, file_name, make_folds, rank_and_world, read_folds, run_folds
@@ -228,10 +227,7 @@ def tabulate(scores: Scores, seconds: Mapping[str, Sequence[float]], protocol: s
     tables.insert(1, sequences_table({name: scores[name] for name in APART if name in scores}))
     tables += [differences_table(name, scores, weights) for name in (JOINT, ENCODED, EXACT) if name in scores and len(scores) > 1]
     tables = [replace(table, title=f"{table.title} ({protocol.replace('_', ' ')})") for table in tables]
-    for table in tables:
-        run.table(table)
-    for method, of_method in scores.items():
-        run.metrics(f"{protocol}/{method}", summarise(of_method))
+    run.tables(protocol, tables)
     return tables
 
 

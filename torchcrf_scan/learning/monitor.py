@@ -24,7 +24,7 @@ from torchcrf_scan.inference import pseudo_likelihood
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.graph import write_graph
 from torchcrf_scan.learning.losses import LOSSES
-from torchcrf_scan.learning.run_log import write_settings
+from torchcrf_scan.learning.run_log import GROUPS, WATCHED, write_settings
 from torchcrf_scan.learning.settings import Config
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.names import LOCAL_CHANNELS
@@ -39,20 +39,13 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 P = ParamSpec("P")
 
-GROUPS = {
-    "accuracy": ("association_accuracy", "association_within_2", "cluster_accuracy", "iou_moving", "movers_found"),
-    "motion": (
-        *("ego_success", "ego_rotation_median", "ego_translation_median", "mover_motion_rotation", "mover_motion_centroid"),
-        "found_mover_centroid_median",
-    ),
-    "calibration": ("association_ece", "cluster_ece", "nees_covered", "nees_mean"),
-}  # figures of `summarise` that are drawn as curves
 LAYOUT = {
     "loss": {"training and validation": ["Multiline", ["loss/total", "validation/total"]]},
     **{
         f"joint and baselines: {group}": {name: ["Multiline", [f"{group}/{name}/.*"]] for name in names}
         for group, names in GROUPS.items()
     },
+    "weights": {chain: ["Multiline", [f"weights/{chain}/.*"]] for chain in ("association", "clustering")},
 }
 DATA, OUTLIER = len(LOCAL_CHANNELS), len(LOCAL_CHANNELS) + 1  # columns of the boosted margins among the unary features
 
@@ -135,9 +128,10 @@ class TrainingMonitor:
             write_graph(self.writer, model, batch, start)
 
     @while_it_can_write
-    def finished(self, settings: Mapping[str, Any], metrics: Mapping[str, float], step: int) -> None:
-        """The settings of the run with its final metrics, for TensorBoard's `hparams`."""
-        write_settings(self.writer, settings, metrics, step)
+    def finished(self, settings: Mapping[str, Any]) -> None:
+        """The settings of the run beside what the last validation told, for TensorBoard's `hparams`."""
+        tags = ["validation/total", *(f"accuracy/{name}/joint" for name in WATCHED)]
+        write_settings(self.writer, settings, tags if self.config.gradient.validation else [])
 
     def _scalars(self, values: Mapping[str, float], step: int) -> None:
         for name, value in values.items():

@@ -1,13 +1,12 @@
-"""TensorBoard events of a run, and its pictures on disk."""
+"""TensorBoard events of a run, and its pictures on disk: what one watches first, then the weights, then pictures and tables."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
@@ -20,13 +19,32 @@ from torchcrf_scan.viz.plots import plot_pair, save_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+GROUPS = {
+    "accuracy": ("association_accuracy", "association_within_2", "cluster_accuracy", "iou_moving", "movers_found"),
+    "motion": (
+        *("ego_success", "ego_rotation_median", "ego_translation_median", "mover_motion_rotation", "mover_motion_centroid"),
+        "found_mover_centroid_median",
+    ),
+    "calibration": ("association_ece", "cluster_ece", "nees_covered", "nees_mean"),
+}  # figures of `summarise` that are drawn as curves
+WATCHED = GROUPS["accuracy"]  # by the staged fit, which looks a few times only
+LAYOUT = {
+    "what one watches": {
+        **{name: ["Multiline", [f"accuracy/{name}/.*"]] for name in WATCHED},
+        "objective": ["Multiline", ["objective/.*"]],
+        "gradient": ["Multiline", ["gradient/.*"]],
+    },
+    "weights": {chain: ["Multiline", [f"weights/{chain}/.*"]] for chain in ("association", "clustering")},
+}  # of the staged fit, for TensorBoard's custom scalars: one chart with many lines each
+
 
 class RunLog:
-    """Events and pictures of one run folder; a context manager."""
+    """Events and pictures of one run folder, where they hide those of an earlier run; a context manager."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.writer = SummaryWriter(str(folder / "events"))
+        self.writer = SummaryWriter(str(folder / "events"), purge_step=0)
+        self.writer.add_custom_scalars(LAYOUT)
 
     def __enter__(self) -> RunLog:
         return self
@@ -34,47 +52,48 @@ class RunLog:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.writer.close()
 
-    def objective(self, tag: str, step: int, loss: float, slope: float, weights: Tensor) -> None:
-        """One optimiser step of one chain: objective and gradient per node, and every weight by name."""
+    def objective(self, tag: str, step: int, loss: float, slope: float) -> None:
+        """One optimiser step of one chain: objective and gradient per node."""
         self.writer.add_scalar(f"objective/{tag}", loss, step)
         self.writer.add_scalar(f"gradient/{tag}", slope, step)
-        both = (*(f"association/{name}" for name in ASSOCIATION_WEIGHTS), *(f"clustering/{name}" for name in CLUSTERING_WEIGHTS))
-        names = {len(of): of for of in (ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS, both)}[len(weights)]
+
+    def weights(self, step: int, weights: Tensor) -> None:
+        """Every weight of one chain, or of both in one lattice, by name."""
+        association = tuple(f"association/{name}" for name in ASSOCIATION_WEIGHTS)
+        clustering = tuple(f"clustering/{name}" for name in CLUSTERING_WEIGHTS)
+        names = {len(of): of for of in (association, clustering, association + clustering)}[len(weights)]
         for name, value in zip(names, weights.tolist(), strict=True):
-            self.writer.add_scalar(f"weights/{tag}/{name}", value, step)
+            self.writer.add_scalar(f"weights/{name}", value, step)
 
-    def metrics(self, method: str, summary: dict[str, float], step: int = 0) -> None:
-        """Every finite number of a summary."""
-        for name, value in summary.items():
-            if np.isfinite(value):
-                self.writer.add_scalar(f"test/{name}/{method}", value, step)
+    def curves(self, method: str, summary: Mapping[str, float], step: int) -> None:
+        """The figures of `WATCHED` after a step of the fit."""
+        for name in WATCHED:
+            self.writer.add_scalar(f"accuracy/{name}/{method}", summary[name], step)
 
-    def settings(self, settings: Mapping[str, Any], summary: Mapping[str, float]) -> None:
-        """The settings of the run with its results."""
-        write_settings(self.writer, settings, summary)
+    def settings(self, settings: Mapping[str, Any], watched: Sequence[str]) -> None:
+        """The settings of the run beside the last values of some of its scalars."""
+        write_settings(self.writer, settings, watched)
 
-    def picture(self, pair: ScanPair, prediction: PairPrediction, step: int = 0) -> None:
-        """The pair with its prediction and the truth side by side: an event and a PNG."""
+    def picture(self, pair: ScanPair, prediction: PairPrediction, step: int = 0, name: str = "") -> None:
+        """The pair with its prediction and the truth side by side: an event, a tag a pair, and with a name a PNG."""
         figure = plot_pair(pair, prediction)
-        save_figure(figure, self.folder / "pictures" / f"{step:02d}_{pair.name}.png")
-        self.figure("pair", figure, step)
+        if name:
+            save_figure(figure, self.folder / "pictures" / f"{name}.png")
+        self.figure(f"pair/{pair.name}", figure, step)
 
     def figure(self, tag: str, figure: Figure, step: int = 0) -> None:
         """A figure as an event, without a PNG; it is not closed."""
         self.writer.add_figure(tag, figure, step, close=False)
 
-    def table(self, table: Table, step: int = 0) -> None:
-        """A table as text, under its title."""
-        self.writer.add_text(f"tables/{table.title}", table.to_markdown(), step)
+    def tables(self, title: str, tables: Sequence[Table]) -> None:
+        """Tables as one text."""
+        self.writer.add_text(title, "\n\n".join(table.to_markdown() for table in tables))
 
 
-def write_settings(writer: SummaryWriter, settings: Mapping[str, Any], metrics: Mapping[str, float], step: int = 0) -> None:
-    """For TensorBoard's `hparams`: settings by their full names, and finite metrics as `final/NAME`."""
+def write_settings(writer: SummaryWriter, settings: Mapping[str, Any], watched: Sequence[str]) -> None:
+    """For TensorBoard's `hparams`: settings by their full names beside the last values of the scalars of some tags."""
     allowed = {name: value if isinstance(value, bool | int | float | str) else str(value) for name, value in settings.items()}
-    final = {f"final/{name}": float(value) for name, value in metrics.items() if np.isfinite(value)}
     events = writer.file_writer
     assert events is not None
-    for summary in hparams(allowed, final):
+    for summary in hparams(allowed, dict.fromkeys(watched, 0.0)):
         events.add_summary(summary)
-    for name, value in final.items():
-        writer.add_scalar(name, value, step)

@@ -20,6 +20,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcrf_scan.baselines.cascade import Cascade
+from torchcrf_scan.baselines.start import match_start
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.dataset import PairFiles, split_by_sequence
 from torchcrf_scan.data.simulate import simulate_pairs
@@ -38,15 +39,15 @@ from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.learning.monitor import TrainingMonitor
 from torchcrf_scan.learning.own_start import own_starts, start_anew
 from torchcrf_scan.learning.ranks import ALONE, Ranks, join
-from torchcrf_scan.learning.run_log import RunLog
+from torchcrf_scan.learning.run_log import WATCHED, RunLog
 from torchcrf_scan.learning.selection_fit import fit_potential
 from torchcrf_scan.learning.settings import AugmentConfig, Config, DataConfig
+from torchcrf_scan.learning.staged_watch import StagedWatch
 from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.pretrained import find_weights
 from torchcrf_scan.scan import PairPrediction, ScanPair
-from torchcrf_scan.variants.register import ONE_CHAINS
 from torchcrf_scan.whole_file import write_whole
 
 log = logging.getLogger(__name__)
@@ -94,7 +95,8 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
         log.info("going on from step %d" if state else "no checkpoint yet, beginning anew", *([state["step"]] if state else []))
     with RunLog(folder) if ranks.is_first else nullcontext() as run:
         model = JointScanCRF(config.model)
-        material = prepare(model, train_pairs, config, run, state) if run is not None else []
+        watch = StagedWatch(run) if run is not None else None
+        material = prepare(model, train_pairs, config, watch, state) if watch is not None else []
         if config.has_steps:
             ranks.share_weights(model)
             first_step = state["step"] + 1 if state else None
@@ -114,18 +116,32 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
         scores, answers = evaluate(model, decoders, test_pairs, config.learning.batch_size, ranks)
         if run is None:
             return scores
-        for step, k in enumerate(pairs_to_draw(test_pairs)):
-            run.picture(test_pairs[k], answers["joint"][k], step)
-        for method, of_method in scores.items():
-            run.metrics(method, summarise(of_method))
-        if not config.has_steps and scores["joint"]:
-            run.settings(flatten(config), summarise(scores["joint"]))
+        tables = report(scores) if scores["joint"] else []
+        show(run, watch, model, test_pairs, answers["joint"], config)
+        run.tables("final", tables)
     if config.has_steps and scores["joint"]:
         with TrainingMonitor(folder, config, config.gradient.steps + 1) as monitor:
-            monitor.finished(flatten(config), summarise(scores["joint"]), config.gradient.steps)
-    tables = report(scores) if scores["joint"] else []
+            monitor.finished(flatten(config))
     write_results(folder, scores, tables)
     return scores
+
+
+def show(
+    run: RunLog,
+    watch: StagedWatch | None,
+    model: JointScanCRF,
+    pairs: Sequence[ScanPair],
+    answers: Sequence[PairPrediction],
+    config: Config,
+) -> None:
+    """Pictures of some pairs before and after learning, and of a staged fit its curves and its settings."""
+    last = config.gradient.steps if config.has_steps else max(1, watch.last if watch is not None else 1)
+    for number, k in enumerate(pairs_to_draw(pairs)):
+        run.picture(pairs[k], match_start(model, [pairs[k]])[0], 0)
+        run.picture(pairs[k], answers[k], last, f"{number:02d}_{pairs[k].name}")
+    if watch is not None and not config.has_steps:
+        watch.look_back(model, pairs)
+        run.settings(flatten(config), [f"accuracy/{name}/joint" for name in WATCHED] if pairs else [])
 
 
 def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], list[ScanPair]]:
@@ -143,7 +159,7 @@ def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], lis
 
 
 def prepare(
-    model: JointScanCRF, pairs: Sequence[ScanPair], config: Config, run: RunLog, state: dict[str, Any] | None
+    model: JointScanCRF, pairs: Sequence[ScanPair], config: Config, watch: StagedWatch, state: dict[str, Any] | None
 ) -> list[Material]:
     """Material from the pairs, and the initial model of first-order training: staged fit, `config.init`, or a checkpoint."""
     collection = collect(pairs, config.learning, jobs=-1)
@@ -159,7 +175,7 @@ def prepare(
     if state is not None or config.init:
         return start_anew(model, material, {})
     material = own_starts(model, material, config.staged)
-    fit(model, material, config.staged, watches(run, "joint"))
+    fit(model, material, config.staged, watch.watches())
     return material
 
 
@@ -227,15 +243,15 @@ def decoders_of(model: JointScanCRF, cascade: Cascade | None) -> dict[str, Decod
 
 
 def watches(run: RunLog, method: str) -> dict[str, Watch]:
-    """Callbacks that log the weight fits under the method's name."""
+    """Callbacks that log the weight fits of one chain alone under the method's name."""
 
     def watch(chain: str) -> Watch:
         def look(step: int, loss: float, slope: float, weights: Tensor) -> None:
-            run.objective(f"{method}/{chain}", step, loss, slope, weights)
+            run.objective(f"{method}/{chain}", step, loss, slope)
 
         return look
 
-    return {chain: watch(chain) for chain in ("association", "clustering", *ONE_CHAINS)}
+    return {chain: watch(chain) for chain in ("association", "clustering")}
 
 
 @torch.no_grad()
