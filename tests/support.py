@@ -1,6 +1,7 @@
 """What many tests share: one comparison with one tolerance table, and scans made from a seed."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -66,3 +67,18 @@ def pad(points: Tensor, extra: int, value: float = 1e3) -> tuple[Tensor, Tensor]
     rubbish = torch.full((len(points), extra, 2), value, dtype=points.dtype)
     padded = torch.cat([points, rubbish], dim=1)
     return padded, torch.cat([all_real(points), ~all_real(rubbish)], dim=1)
+
+
+def assert_slopes(answers: Callable[..., tuple[Tensor, ...]], *inputs: Tensor, step: float = 1e-6, atol: float = 1e-6) -> None:
+    """`torch.autograd.gradcheck` of a long function: all backward passes at once, and so are the central differences."""
+    slopes = torch.func.jacrev(answers, argnums=tuple(range(len(inputs))))(*inputs)
+    for k, value in enumerate(inputs):
+        steps = step * torch.eye(value.numel(), dtype=value.dtype).view(-1, *value.shape)
+
+        def at(change: Tensor, k: int = k) -> tuple[Tensor, ...]:
+            return answers(*inputs[:k], inputs[k] + change, *inputs[k + 1 :])
+
+        ahead, behind = torch.func.vmap(at)(steps), torch.func.vmap(at)(-steps)
+        for slope, after, before in zip(slopes, ahead, behind, strict=True):
+            own = slope[k].flatten(slope[k].dim() - value.dim()).movedim(-1, 0)  # (inputs, outputs...)
+            torch.testing.assert_close(own, (after - before) / (2 * step), rtol=1e-3, atol=atol)
