@@ -71,14 +71,12 @@ def pad(points: Tensor, extra: int, value: float = 1e3) -> tuple[Tensor, Tensor]
 
 def assert_slopes(answers: Callable[..., tuple[Tensor, ...]], *inputs: Tensor, step: float = 1e-6, atol: float = 1e-6) -> None:
     """`torch.autograd.gradcheck` of a long function: all backward passes at once, and so are the central differences."""
-    slopes = torch.func.jacrev(answers, argnums=tuple(range(len(inputs))))(*inputs)
-    for k, value in enumerate(inputs):
-        steps = step * torch.eye(value.numel(), dtype=value.dtype).view(-1, *value.shape)
+    sizes, point = [value.numel() for value in inputs], torch.cat([value.detach().flatten() for value in inputs])
 
-        def at(change: Tensor, k: int = k) -> tuple[Tensor, ...]:
-            return answers(*inputs[:k], inputs[k] + change, *inputs[k + 1 :])
+    def at(row: Tensor) -> tuple[Tensor, ...]:
+        return answers(*(part.view(value.shape) for part, value in zip(row.split(sizes), inputs, strict=True)))
 
-        ahead, behind = torch.func.vmap(at)(steps), torch.func.vmap(at)(-steps)
-        for slope, after, before in zip(slopes, ahead, behind, strict=True):
-            own = slope[k].flatten(slope[k].dim() - value.dim()).movedim(-1, 0)  # (inputs, outputs...)
-            torch.testing.assert_close(own, (after - before) / (2 * step), rtol=1e-3, atol=atol)
+    steps = step * torch.eye(len(point), dtype=point.dtype)
+    slopes, ahead, behind = torch.func.jacrev(at)(point), torch.func.vmap(at)(point + steps), torch.func.vmap(at)(point - steps)
+    for slope, after, before in zip(slopes, ahead, behind, strict=True):
+        torch.testing.assert_close(slope.movedim(-1, 0), (after - before) / (2 * step), rtol=1e-3, atol=atol)
