@@ -1,6 +1,7 @@
 """What many tests share: one comparison with one tolerance table, and scans made from a seed."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -66,3 +67,16 @@ def pad(points: Tensor, extra: int, value: float = 1e3) -> tuple[Tensor, Tensor]
     rubbish = torch.full((len(points), extra, 2), value, dtype=points.dtype)
     padded = torch.cat([points, rubbish], dim=1)
     return padded, torch.cat([all_real(points), ~all_real(rubbish)], dim=1)
+
+
+def assert_slopes(answers: Callable[..., tuple[Tensor, ...]], *inputs: Tensor, step: float = 1e-6, atol: float = 1e-6) -> None:
+    """`torch.autograd.gradcheck` of a long function: all backward passes at once, and so are the central differences."""
+    sizes, point = [value.numel() for value in inputs], torch.cat([value.detach().flatten() for value in inputs])
+
+    def at(row: Tensor) -> tuple[Tensor, ...]:
+        return answers(*(part.view(value.shape) for part, value in zip(row.split(sizes), inputs, strict=True)))
+
+    steps = step * torch.eye(len(point), dtype=point.dtype)
+    slopes, ahead, behind = torch.func.jacrev(at)(point), torch.func.vmap(at)(point + steps), torch.func.vmap(at)(point - steps)
+    for slope, after, before in zip(slopes, ahead, behind, strict=True):
+        torch.testing.assert_close(slope.movedim(-1, 0), (after - before) / (2 * step), rtol=1e-3, atol=atol)

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from command_line import fail, run
 
-from torchcrf_scan import JointScanCRF
+from torchcrf_scan import JointScanCRF, ModelConfig
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.pair_file import read_prediction
 
 
 def test_calibrate_writes_a_model_that_match_loads(pairs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made, found = tmp_path / "own", tmp_path / "found"
-    for _ in range(2):  # an earlier model is replaced
-        assert run("calibrate", pairs_dir, "--output", made, "--model", "simulated", "--threads=1") == 0
+    JointScanCRF(ModelConfig()).save_pretrained(made)  # an earlier model, which is replaced
+    assert run("calibrate", pairs_dir, "--output", made, "--model", "simulated", "--threads=1") == 0
+    assert JointScanCRF.from_pretrained(made).config == JointScanCRF.from_pretrained("simulated").config
     table = capsys.readouterr().out
     assert all(f"| {part} |" in table for part in ("outlier distance", "scales", "movers' worth", "confidences"))
     assert "4 pairs left out in turn" in table

@@ -275,7 +275,7 @@ def test_evaluate_names_the_bad_argument(
 
 
 def test_a_closed_pipe_is_no_traceback(pairs_dir: Path) -> None:
-    command = [sys.executable, "-m", "torchcrf_scan.cli", "evaluate", str(pairs_dir), "--method=static"]
+    command = [sys.executable, "-m", "torchcrf_scan", "evaluate", str(pairs_dir), "--method=static"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stderr is not None

@@ -1,9 +1,9 @@
 """What `run`, `odometry`, `track` and `play` make of logs, whole, damaged, long, many, and interrupted."""
 
+import contextlib
 import csv
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import fail, run
+from forked import run_ranks
 from PIL import Image
 from results import FakeStream, carmen_log
 
@@ -19,7 +20,6 @@ from torchcrf_scan.commands.outputs import Outputs
 from torchcrf_scan.data.trajectory_file import read_trajectory
 from torchcrf_scan.viz.movie import can_write_mp4
 
-ROOT = Path(__file__).resolve().parents[2]
 MOVIE = "movie.mp4" if can_write_mp4() else "movie.gif"
 ALL = {"poses.tum", "tracks.csv", "summary.png", MOVIE}
 
@@ -185,6 +185,7 @@ def test_a_failing_output_is_closed_once() -> None:
     assert ended == [OSError]
 
 
+@pytest.mark.usefixtures("fast_start")
 def test_ctrl_c_leaves_what_was_written_valid(
     stream: FakeStream, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -217,16 +218,24 @@ def test_the_real_stream_finds_the_way_along_a_room(tmp_path: Path) -> None:
     np.testing.assert_allclose(path.poses[:, 1], 0.1 * np.arange(6), atol=0.03)
 
 
+def run_rank(folder: Path, arguments: list[str]) -> None:
+    """A process of `torchrun` that makes every output itself, its errors in a file of its own."""
+    sys.modules["torchcrf_scan.commands.run"].Apart = lambda output, *given: output(*given)  # type: ignore[attr-defined]
+    with (folder / f"errors_{os.environ['RANK']}").open("w") as errors, contextlib.redirect_stderr(errors):
+        code = run(*arguments)
+    sys.exit(code)
+
+
 def test_torchrun_deals_logs_out(tmp_path: Path) -> None:
     logs = [carmen_log(tmp_path / f"{name}.log", 3) for name in "ab"]
     (tmp_path / "c.log").write_text("nothing\n")
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "torchcrf_scan", "run"]
-    told = [*map(str, logs), str(tmp_path / "c.log"), "--output", str(tmp_path / "out"), "--threads=1"]
-    done = subprocess.run([*command, *told], cwd=ROOT, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 1
-    assert names(tmp_path / "out") == {"a", "b"}, done.stderr
+    arguments = ["run", *map(str, logs), str(tmp_path / "c.log"), "--output", str(tmp_path / "out"), "--threads=1"]
+    assert run_ranks(run_rank, tmp_path, arguments) == [1, 1]
+    assert names(tmp_path / "out") == {"a", "b"}
     assert all(names(tmp_path / "out" / name) == ALL for name in "ab")
-    assert done.stderr.count("torchcrf-scan run: error: ") == 1
+    first, second = ((tmp_path / f"errors_{rank}").read_text() for rank in "01")
+    assert first.count("torchcrf-scan run: error: ") == 1
+    assert second == ""
 
 
 def test_the_distance_of_outliers_is_an_option(log_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

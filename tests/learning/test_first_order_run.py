@@ -46,6 +46,7 @@ def run(arguments: list[str], tmp_path_factory: pytest.TempPathFactory, drawn_on
     return folder
 
 
+@pytest.mark.usefixtures("drawn_once")
 @pytest.mark.parametrize("is_anew", [True, False])
 def test_the_potential_of_movers_is_fitted_anew_or_kept(arguments: list[str], tmp_path: Path, is_anew: bool) -> None:
     own = [of for of in arguments if not of.startswith("--model") and "steps" not in of]
