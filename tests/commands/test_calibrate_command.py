@@ -9,6 +9,7 @@ from command_line import fail, run
 from torchcrf_scan import JointScanCRF, ModelConfig
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.pair_file import read_prediction
+from torchcrf_scan.learning.leaks import TrainedOn
 
 
 def test_calibrate_writes_a_model_that_match_loads(pairs_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -22,6 +23,7 @@ def test_calibrate_writes_a_model_that_match_loads(pairs_dir: Path, tmp_path: Pa
     assert run("match", pairs_dir, "--output", found, "--model", made, "--threads=1") == 0
     pair = next(iter(PairFiles(pairs_dir)))
     expected = JointScanCRF.from_pretrained(made).match_pairs([pair])[0]
+    assert {one.sequence for one in PairFiles(pairs_dir)} < set(TrainedOn.of_model(str(made)).sequences)
     np.testing.assert_array_equal(read_prediction(found / f"{pair.name}.npz").association, expected.association)
 
 

@@ -17,7 +17,10 @@ def test_the_nearest_association_has_a_gate() -> None:
     motions = torch.zeros(1, 2, 3).double()
     assert nearest_association(batch, motions, torch.tensor([[True, False]])).tolist() == [[0, 1, -1, -1]]
     back = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 3.3 * unit, 0.0]]]).double()
-    assert nearest_association(batch, back, torch.ones(1, 2, dtype=torch.bool)).tolist() == [[0, 1, 2, -1]]
+    both = torch.ones(1, 2, dtype=torch.bool)
+    assert nearest_association(batch, back, both).tolist() == [[0, 1, 2, -1]]
+    reach = torch.tensor([[[0.0, 0.0], [0.0, 0.0], [0.0, 0.1], [0.0, 0.0]]]).double()  # the second motion explains it, from afar
+    assert nearest_association(batch, back, both, reach).tolist() == [[0, 1, -1, -1]]
 
 
 def test_background_alone_is_the_first_motion() -> None:

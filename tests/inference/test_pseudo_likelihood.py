@@ -448,3 +448,24 @@ def test_matching_is_scored_as_it_is_fitted() -> None:
     own = model.view(batch).batch
     expected = model.pseudo_log_likelihood(batch, for_background_alone(true_plugins(own, C), own))
     assert_close(model.pseudo_log_likelihood(batch).detach(), expected.detach())
+
+
+# --- reaches ----------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["hard", "soft", "off"])
+def test_a_mover_beyond_its_reach_is_no_alternative(pairs: ScanPairBatch, mode: str) -> None:
+    model = JointScanCRF(ModelConfig(features=FeatureConfig(reach=mode))).double()
+    view = model.view(pairs)
+    plugins = true_plugins(view.batch, 7)
+    label = plugins.label.masked_fill(plugins.label < 0, 0)[..., None]
+    beyond = torch.rand(*plugins.label.shape, 7, generator=torch.Generator().manual_seed(4)) < 0.3
+    beyond = beyond.scatter(-1, label, False)  # the true clusters are within reach
+    plugins = replace(plugins, active=torch.ones_like(plugins.active), reach=beyond.double())
+    chain = clustering_chain(view, plugins, model.scales)
+    assert torch.equal(chain.mask[..., :7], ~beyond if mode == "hard" else torch.ones_like(beyond))
+    assert chain.mask[..., 7].all()
+    with torch.no_grad():
+        within = model.pseudo_log_likelihood(pairs, plugins)
+        blind = model.pseudo_log_likelihood(pairs, replace(plugins, reach=None))
+    assert torch.equal(within > blind, torch.full_like(pairs.source_closed, mode == "hard"))  # a soft weight begins at 0

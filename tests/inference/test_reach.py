@@ -12,11 +12,16 @@ from support import assert_close, generator, make_points
 from torch import Tensor
 
 from torchcrf_scan import JointScanCRF
+from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.features.potentials import PairView
+from torchcrf_scan.inference.joint import first_state
+from torchcrf_scan.inference.selection import evidence
 from torchcrf_scan.inference.start import FARTHEST, REACH_EXTENT, REACH_UNITS, Start, beyond_reach
 from torchcrf_scan.prediction import Prediction
 
 C = len(MOTIONS)
+VARIANTS = ("sweep", "flooding", "lattice")
 
 
 def by_loops(points: list[list[float]], members: list[int], unit: float) -> list[float]:
@@ -62,7 +67,7 @@ def test_it_has_a_gradient_in_the_points() -> None:
 # --- in the model -------------------------------------------------------------------------------------------------------------
 
 
-def begun() -> tuple[object, Start, Tensor]:
+def begun() -> tuple[ScanPairBatch, Start, Tensor]:
     """A scene, its start with reaches of all sizes, and them."""
     batch, _ = scene(40)
     reach = (4 * torch.rand(1, 40, C, generator=generator(2), dtype=torch.float64) - 2).clamp(min=0)
@@ -70,18 +75,30 @@ def begun() -> tuple[object, Start, Tensor]:
     return batch, replace(make_start(batch, MOTIONS), reach=reach), reach
 
 
-def answer(mode: str, weight: float = 0.0, *, blind: bool = False) -> Prediction:
-    inference = InferenceConfig(clusters=C + 1, iterations=2, stop_early=False, backend="eager")
-    model = JointScanCRF(ModelConfig(features=FeatureConfig(reach=mode), inference=inference)).double().requires_grad_(False)
+def layer(mode: str, weight: float = 0.0, variant: str = "sweep") -> JointScanCRF:
+    """An unfitted model; weight: of the feature that soft reaches have."""
+    coupling, schedule = ("lattice", "sweep") if variant == "lattice" else ("motions", variant)
+    inference = InferenceConfig(clusters=C + 1, iterations=2, stop_early=False, backend="eager", schedule=schedule)
+    config = ModelConfig(features=FeatureConfig(reach=mode), inference=inference, coupling=coupling)
+    model = JointScanCRF(config).double().requires_grad_(False)
     if mode == "soft":
         model.clustering_weights["reach"].fill_(weight)
+    return model
+
+
+def answer(mode: str, weight: float = 0.0, variant: str = "sweep", *, blind: bool = False) -> Prediction:
     batch, start, _ = begun()
-    return model(batch, replace(start, reach=None) if blind else start)
+    return layer(mode, weight, variant)(batch, replace(start, reach=None) if blind else start)
 
 
-def test_hard_rules_out_what_is_beyond_and_nothing_else() -> None:
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_hard_rules_out_what_is_beyond_and_nothing_else(variant: str) -> None:
     _, _, reach = begun()
-    assert torch.equal(answer("hard").log_cluster[..., :C] == -torch.inf, reach > 0)
+    found = answer("hard", variant=variant)
+    is_ruled_out = found.log_cluster[..., :C] == -torch.inf
+    assert found.active[0, 1:].any()
+    assert is_ruled_out[reach > 0].all()
+    assert not is_ruled_out[(reach == 0) & found.active[:, None]].any()
 
 
 def test_off_and_a_weight_of_nothing_are_blind() -> None:
@@ -96,6 +113,54 @@ def test_soft_is_hard_in_the_limit() -> None:
     assert torch.equal(soft.cluster, hard.cluster)
     assert (soft.log_cluster > -torch.inf).all()
     assert not torch.equal(answer("off").cluster, hard.cluster)
+
+
+def is_beyond(cluster: Tensor, reach: Tensor) -> Tensor:
+    """(B, N) points that are beyond the reach of their own cluster; an outlier is not, as the background reaches everything."""
+    return reach.gather(-1, cluster.clamp(min=0)[..., None])[..., 0] > 0
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_point_beyond_a_movers_reach_is_not_given_to_it(variant: str) -> None:
+    _, _, reach = begun()
+    assert is_beyond(answer("off", variant=variant).cluster, reach).any()
+    for found in (answer("hard", variant=variant), answer("soft", 1e9, variant)):
+        assert not is_beyond(found.cluster, reach).any()
+        assert (found.cluster > 0).any()
+
+
+def test_no_point_begins_in_a_mover_beyond_its_reach() -> None:
+    batch, start, reach = begun()
+    model = layer("hard")
+    hard, off = (
+        first_state(PairView.of(batch, reach=mode), start, model.fitted, model.config.inference) for mode in ("hard", "off")
+    )
+    assert is_beyond(off.cluster, reach).any()
+    assert not is_beyond(hard.cluster, reach).any()
+    is_within = ~is_beyond(off.cluster, reach)
+    assert torch.equal(hard.cluster[is_within], off.cluster[is_within])
+    assert torch.equal(hard.log_cluster.argmax(-1), hard.cluster % (C + 1))  # -1, the outlier, is the last state
+
+
+@pytest.mark.parametrize("backend", ["eager", "auto"])
+def test_a_mover_beyond_whose_reach_all_points_are_explains_none(backend: str) -> None:
+    """By its motion alone it would explain many. The evidence decides which movers the rounds begin with."""
+    batch, start, _ = begun()
+    reach = torch.zeros(1, 40, C, dtype=torch.float64)
+    reach[..., 2] = FARTHEST
+    start = replace(start, reach=reach, log_odds=torch.tensor([[torch.inf, 0.0, 0.0]], dtype=torch.float64))
+
+    def explained(mode: str, weight: float = 0.0) -> list[float]:
+        model, view = layer(mode, weight), PairView.of(batch, reach=mode)
+        config = replace(model.config.inference, backend=backend)
+        state = first_state(view, start, model.fitted, config)
+        return [float(of) for of in evidence(view, start, state, model.fitted, config)[0]]
+
+    hard, soft, off = explained("hard"), explained("soft", 1e9), explained("off")
+    assert hard[1] > 1
+    assert hard[2] == 0
+    assert off[2] > 1
+    assert soft == pytest.approx(hard, abs=1e-6)
 
 
 def test_a_saved_model_without_the_setting_is_hard(tmp_path: Path) -> None:

@@ -13,23 +13,26 @@ from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning.checkpoint import Store
+from torchcrf_scan.learning.leaks import TrainedOn
 from torchcrf_scan.learning.settings import AugmentConfig, Config, DataConfig, GradientConfig, LearningConfig
 from torchcrf_scan.learning.trainer import flatten, hold_out, load_data, load_weights, settings_of
 from torchcrf_scan.model import JointScanCRF
+
+SEED = 33  # of no world that the shipped weights were trained on
 
 
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Pair files of four sequences, coarse so that everything is quick."""
     folder = tmp_path_factory.mktemp("pairs")
-    for k, pair in enumerate(simulate_pairs(SimulatorConfig(beams=61), 8, 4, 3)):
+    for k, pair in enumerate(simulate_pairs(SimulatorConfig(beams=61), 8, 4, SEED)):
         write_pair(folder / f"{pair.sequence}_{k}.npz", pair)
     return folder
 
 
 @pytest.fixture(scope="module")
 def arguments(pairs: Path) -> list[str]:
-    train, test = [f"{pairs}/sim3_{k}_*.npz" for k in (0, 1, 2)], f"{pairs}/sim3_3_*.npz"
+    train, test = [f"{pairs}/sim{SEED}_{k}_*.npz" for k in (0, 1, 2)], f"{pairs}/sim{SEED}_3_*.npz"
     return [
         *(f"--data.train={json.dumps(train)}", f"--data.test={test}", "--data.simulate_train=[]", "--data.simulate_test=[]"),
         *("--learning.folds=2", "--learning.max_steps=10", "--learning.booster_examples=500", "--learning.objective=unrolled"),
@@ -99,6 +102,19 @@ def test_training_can_begin_from_a_saved_model(run: Path, arguments: list[str], 
     assert torch.equal(moved.boosters.data.table, first.boosters.data.table)
     assert torch.equal(moved.hypothesis_score.state_dict()["mean"], first.hypothesis_score.state_dict()["mean"])
     assert not torch.equal(moved.association_weights["sequence"], first.association_weights["sequence"])
+    seen = TrainedOn(tuple(f"sim{SEED}_{k}" for k in range(3)))
+    assert TrainedOn.of_model(str(run / "model")) == TrainedOn.of_model(str(tmp_path / "model")) == seen
+
+
+def test_what_the_initial_weights_were_trained_on_is_not_tested(
+    run: Path, pairs: Path, arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turned = [f"--data.train={pairs}/sim{SEED}_3_*.npz", f"--data.test={pairs}/sim{SEED}_0_*.npz"]
+    init = run / "model"
+    assert load_main()([*arguments, *turned, f"--init={init}", f"--output={tmp_path}"]) == 1
+    told = f"init {init}: expected no sequence in both training and test pairs, got sim{SEED}_0"
+    assert capsys.readouterr().err.strip().splitlines()[-1] == f"train.py: error: {told}"
+    assert not (tmp_path / "config.yaml").exists()
 
 
 def test_the_saved_config_is_read_again(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scenes import make_batch, make_start
 
 from torchcrf_scan.baselines.register import BASELINES, Baseline, installed
+from torchcrf_scan.batch import Truth
 from torchcrf_scan.config import EncoderConfig
-from torchcrf_scan.experiment.methods import METHODS, Answer, answer, with_config, with_motions_given
+from torchcrf_scan.experiment.methods import METHODS, Answer, answer, true_start, with_config, with_motions_given
 from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT, LATTICE, LATTICE_EXACT, Models, fit_models
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
@@ -95,6 +97,24 @@ def test_true_motions_and_true_associations_stay(answers: dict[str, Answer], sma
         assert ((turn < 1e-5) & (shift < 1e-4)).any()
     told = answers["joint, true associations"].prediction.association[pair.source.beam]
     assert (told == truth.association[pair.source.beam]).all()
+
+
+def test_the_true_start_ends_a_mover_at_its_reach() -> None:
+    """A background point whose counterpart is missing comes to lie on another point by the motion of a mover far away."""
+    apart = torch.stack([0.5 * torch.arange(26), 10 + 0.1 * torch.arange(26) ** 2 % 0.3], dim=-1).double()
+    apart[20:, 0] += 20
+    cluster = (torch.arange(26) >= 20).long()[None]
+    motions = torch.tensor([[[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]]]).double()
+    moved = apart + motions[0, cluster[0], 1:]
+    moved[0] = apart[0] + motions[0, 1, 1:]
+    association = torch.arange(26)[None].clone()
+    cluster[0, 0] = association[0, 0] = -1
+    batch = make_batch(apart[None], moved[None])
+    batch = replace(batch, truth=Truth(association, cluster, motions, torch.ones_like(batch.source_mask)))
+    found = true_start(batch, make_start(batch, motions[0]))
+    assert torch.equal(found.association, association)
+    assert found.reach is not None
+    assert (found.reach[0, :, 1] > 0).tolist() == (torch.arange(26) < 20).tolist()
 
 
 def test_the_joint_model_alone_is_the_same_model(

@@ -46,10 +46,17 @@ from torchcrf_scan.inference.messages import chain_beliefs, log_partition
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
+from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.variants import sweep
 from torchcrf_scan.variants.lattice import LatticeBeliefs, lattice_beliefs, lattice_log_partition, lattice_messages
-from torchcrf_scan.variants.lattice_features import LatticeFeatures, LatticePotentials, lattice_features, transition_kinds
+from torchcrf_scan.variants.lattice_features import (
+    MOVING_WEIGHTS,
+    LatticeFeatures,
+    LatticePotentials,
+    lattice_features,
+    transition_kinds,
+)
 
 SEEDS = st.integers(0, 10_000)
 NODES, CANDIDATES, CLUSTERS = st.integers(1, 4), st.integers(0, 2), st.integers(1, 2)
@@ -315,6 +322,25 @@ def test_with_extensions_they_equal_the_loops_too_and_so_does_the_answer(seed: i
         j, k = np.divmod(np.array(oracles.best_labelling(unary, pairwise)), C + 1)
         assert answer.association[0].tolist() == np.where(j == M, -1, j).tolist()
         assert answer.cluster[0].tolist() == np.where(k == C, -1, k).tolist()
+
+
+def test_what_a_mover_explains_beyond_its_reach_is_unexplained() -> None:
+    batch, cluster = scene(24)
+    scales, boosters = Scales().double(), Boosters(1).double()
+    reach = torch.arange(3) != 1  # the first mover reaches none
+    feature = MOVING_WEIGHTS.index(len(ASSOCIATION_WEIGHTS) + CLUSTERING_WEIGHTS.index("outlier"))
+
+    def unexplained(within: Tensor | None) -> list[bool]:
+        possible = possible_clusters(torch.ones(1, 3, dtype=torch.bool), within, 24)
+        found = features_of(batch, MOTIONS, possible, scales, boosters).moving[0, ..., -1, feature]  # of the outlier cluster
+        return (found == 1).all(-1).tolist()
+
+    assert not any(unexplained(None))
+    apart = torch.stack([torch.cdist(se2.apply(motion, batch.source[0]), batch.target[0]).amin(-1) for motion in MOTIONS[reach]])
+    expected = apart.amin(0) > scales.outlier_threshold
+    assert unexplained(reach) == expected.tolist()
+    assert expected.any()
+    assert not expected[cluster != 1].any()
 
 
 @pytest.mark.parametrize("search", ["motion", "position"])

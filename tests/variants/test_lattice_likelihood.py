@@ -8,7 +8,7 @@ import oracles
 import pytest
 import torch
 from scenes import MOTIONS, make_batch, random_stumps
-from support import assert_close, extended, make_points, normal
+from support import assert_close, extended, generator, make_points, normal
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
@@ -234,14 +234,20 @@ def test_the_model_measures_what_the_fit_does() -> None:
     assert all(weight.grad is not None for weight in model.parameters())
 
 
-def test_the_chain_keeps_the_features_of_the_decoding() -> None:
+@pytest.mark.parametrize("mode", ["hard", "soft", "off"])
+def test_the_chain_keeps_the_features_of_the_decoding(mode: str) -> None:
     batch, scales, boosters = simulated(), Scales().double(), Boosters(1).double()
-    plugins, view = true_plugins(batch, 4), PairView.of(batch)
+    plugins, view = true_plugins(batch, 4), PairView.of(batch, reach=mode)
+    reach = (4 * torch.rand(*plugins.label.shape, 4, generator=generator(3), dtype=torch.float64) - 2).clamp(min=0)
+    plugins = replace(plugins, reach=reach * (torch.arange(4) > 0))
     config = InferenceConfig(clusters=5, candidates=0)
     found = find_candidates(view, plugins.motions, plugins.active, config)
     states = AssociationStates.of(view, found.index, found.mask, scales, boosters)
     possible = possible_clusters(plugins.active, view.within(plugins.reach), batch.source.shape[1])
-    features = lattice_features(view, states, plugins.motions, found.nearest, possible, scales, boosters)
+    features = lattice_features(view, states, plugins.motions, found.nearest, possible, scales, boosters, plugins.reach)
     chain = lattice_chain(view, plugins, scales, boosters, config)
     for f in fields(LatticeFeatures):
         assert torch.equal(getattr(chain, f.name), getattr(features, f.name)), f.name
+    within = (plugins.reach == 0) | (mode != "hard")
+    assert torch.equal(possible[..., :4], plugins.active[:, None] & within)
+    assert (chain.moving[..., -1] != 0).any() == (mode == "soft")

@@ -14,7 +14,7 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.inference.start import Start
+from torchcrf_scan.inference.start import FARTHEST, Start
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.names import LOCAL_CHANNELS, SHAPE_CHANNELS
 from torchcrf_scan.variants.paper_start import EXPLAINED, agreed_motion, match_cold, paper_start
@@ -72,6 +72,9 @@ def test_the_start_is_what_decoding_needs(found: Start, batch: ScanPairBatch) ->
     assert found.motions.isfinite().all()
     assert found.active[:, 0].all()
     assert (found.association[~batch.source_mask] == -1).all()
+    assert found.reach is not None
+    assert (found.reach[..., 0] == 0).all()
+    assert (found.reach.amin(1)[~found.active] == FARTHEST).all()  # empty slots, which are nowhere
 
 
 @pytest.mark.parametrize("look", list(LOOKS.values()), ids=list(LOOKS))

@@ -22,6 +22,7 @@ def calibrate(pair_files: list[str], output: str, *, model: str = PRETRAINED, th
         model: folder of a saved model to start from, or the name of one that the package ships
         threads: number of threads that torch computes with; by default its own choice
     """
+    from torchcrf_scan.learning.leaks import TrainedOn
     from torchcrf_scan.learning.own_laser import calibrate_on
 
     pairs = {path: read_pair(path) for path in find_files(pair_files)}
@@ -33,7 +34,9 @@ def calibrate(pair_files: list[str], output: str, *, model: str = PRETRAINED, th
     if any(folder.iterdir()) and not (folder / WEIGHTS).is_file():
         raise ValueError(f"--output: expected a new folder or one of a saved model, got {output} with other files")
     fitted, parts = calibrate_on(network, list(pairs.values()))
+    trained_on = TrainedOn.of_model(model).plus(pairs.values())
     fitted.save_pretrained(folder)
+    trained_on.write(folder)
     print(f"| part | fitted | {len(pairs)} pairs left out in turn: before | after | |\n|---|---|---|---|---|")
     for part in parts:
         told = "kept" if part.is_kept else "not kept: the pairs left out do not gain"

@@ -25,6 +25,7 @@ from torchcrf_scan.experiment.cross_validation import Results, cores, file_name,
 from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
+from torchcrf_scan.learning.leaks import TrainedOn
 from torchcrf_scan.learning.run_log import RunLog
 from torchcrf_scan.scan import Ints, PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_associations, save_figure
@@ -52,10 +53,12 @@ def run_experiment(config: RunConfig) -> dict[str, list[Table]]:
         The tables of every protocol; none on ranks of `torchrun` other than 0.
 
     Raises:
-        ValueError: nothing to leave out, an unknown pair to draw, or a folder of another experiment.
+        ValueError: nothing to leave out, a tested sequence that is trained on too, an unknown pair to draw, or a folder of
+            another experiment.
     """
     folder = Path(config.output)
     pairs, tested = load_pairs(config)
+    refuse_leaks([config], pairs, tested)
     figures = find_pairs(config.experiment.figures, pairs[:tested])
     folds = {
         protocol: make_folds(protocol, pairs, tested, config.experiment.test_every) for protocol in config.experiment.protocols
@@ -90,6 +93,7 @@ def run_ablations(config: RunConfig, variants: Mapping[str, RunConfig]) -> list[
         ValueError: as `run_experiment`.
     """
     pairs, tested = load_pairs(config)
+    refuse_leaks([config, *variants.values()], pairs, tested)
     scores, seconds = {}, {}
     with TemporaryDirectory() as kept:
         looks = Looks(pairs, Path(kept))
@@ -147,6 +151,13 @@ def load_pairs(config: RunConfig) -> tuple[list[ScanPair], int]:
     if bare or not tested:
         raise ValueError(f"experiment.pairs: expected annotated pairs, got {bare[:3] or 'none'}")
     return [*tested, *simulate(experiment.also_train, config, data.seed + ALSO_TRAIN_SEED)], len(tested)
+
+
+def refuse_leaks(configs: Sequence[RunConfig], pairs: Sequence[ScanPair], tested: int) -> None:
+    """Raises ValueError if a tested sequence is always trained on, or was for the initial weights of an encoder."""
+    TrainedOn().plus(pairs[tested:]).refuse(pairs[:tested], "experiment.also_train")
+    for init in sorted({config.init for config in configs if config.model.encoder.width > 0}):
+        TrainedOn.of_model(init).refuse(pairs[:tested], f"init {init}")
 
 
 def simulate(worlds: Sequence[str], config: RunConfig, seed: int) -> list[ScanPair]:

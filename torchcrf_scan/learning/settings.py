@@ -221,7 +221,7 @@ class Config:
         overfit: train and test on the first training pair alone, a quick check that everything can learn.
         compare_chains: also fit and evaluate CRF-Matching and CRF-Clustering alone.
         init: a model, as a folder or by the name of a shipped one, with the initial weights of first-order training; none: those
-            of the staged fit.
+            of the staged fit. The sequences that it was trained on (`learning.leaks`) must not be tested.
     """
 
     data: DataConfig = field(default_factory=DataConfig)

@@ -35,6 +35,7 @@ from torchcrf_scan.learning.cascade_fit import fit_cascade
 from torchcrf_scan.learning.checkpoint import Store, load_weights
 from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.gradient import train_by_gradient
+from torchcrf_scan.learning.leaks import TrainedOn
 from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.learning.monitor import TrainingMonitor
 from torchcrf_scan.learning.own_start import own_starts, start_anew
@@ -46,7 +47,6 @@ from torchcrf_scan.learning.staged_watch import StagedWatch
 from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction
-from torchcrf_scan.pretrained import find_weights
 from torchcrf_scan.scan import PairPrediction, ScanPair
 from torchcrf_scan.whole_file import write_whole
 
@@ -71,8 +71,7 @@ def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]
 
 def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dict[str, list[PairScore]]:
     """This process's share of `train`."""
-    if config.init:
-        find_weights(config.init)  # fails early if there is no such model
+    trained_on = TrainedOn.of_model(config.init)  # fails early if there is no such model
     folder, resolved = Path(config.output), yaml.safe_dump(asdict(config), sort_keys=False)
     folder.mkdir(parents=True, exist_ok=True)
     train_pairs, test_pairs = load_data(config.data)
@@ -80,7 +79,9 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
         train_pairs = test_pairs = train_pairs[:1]
         config = replace(config, gradient=replace(config.gradient, fresh=0.0, augment=AugmentConfig.nothing()))
     else:
-        refuse_leaks(train_pairs, test_pairs)
+        TrainedOn().plus(train_pairs).refuse(test_pairs, "data")
+        trained_on.refuse(test_pairs, f"init {config.init}")
+    trained_on = trained_on.plus(train_pairs)
     train_pairs, held_out = hold_out(train_pairs, config)
     log.info("%d training pairs, %d validation pairs, %d test pairs", len(train_pairs), len(held_out), len(test_pairs))
 
@@ -110,6 +111,7 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
             calibrate(model, material)
             cascade = fit_baselines(material, config, run)
             model.save_pretrained(folder / "model")
+            trained_on.write(folder / "model")
             log.info("fitted in %.0f s", time.perf_counter() - began)
         ranks.share_weights(model)
         decoders = decoders_of(model, ranks.share(cascade))
@@ -215,13 +217,6 @@ def load_data(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
         load(config.train, config.simulate_train, config.seed),
         load(config.test, config.simulate_test, config.seed + TEST_SEED),
     )
-
-
-def refuse_leaks(train_pairs: Sequence[ScanPair], test_pairs: Sequence[ScanPair]) -> None:
-    """Raises ValueError if a sequence is in both training and test: its pairs overlap in time."""
-    both = sorted({pair.sequence for pair in train_pairs} & {pair.sequence for pair in test_pairs})
-    if both:
-        raise ValueError(f"data: expected no sequence in both training and test pairs, got {', '.join(both[:5])}")
 
 
 def fit_baselines(material: list[Material], config: Config, run: RunLog) -> Cascade | None:
