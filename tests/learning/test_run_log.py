@@ -46,11 +46,11 @@ def test_a_figure_is_an_event_and_no_file(tmp_path: Path) -> None:
 
 def test_settings_of_a_staged_run_stand_beside_its_last_figures(tmp_path: Path) -> None:
     with RunLog(tmp_path) as log:
-        log.curves("joint", dict.fromkeys(WATCHED, 83.0), step=1)
-        log.settings({"learning.prior": 10.0, "data.simulate_train": ("street",)}, ["accuracy/cluster_accuracy/joint"])
+        log.curves(dict.fromkeys(WATCHED, 83.0), step=1)
+        log.settings({"learning.prior": 10.0, "data.simulate_train": ("street",)}, ["accuracy/cluster_accuracy"])
     events = read(tmp_path)
     data = events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content
     settings = plugin_data_pb2.HParamsPluginData.FromString(data).session_start_info.hparams
     assert settings["learning.prior"].number_value == 10.0
     assert settings["data.simulate_train"].string_value == "('street',)"
-    assert sorted(events.Tags()["scalars"]) == sorted(f"accuracy/{name}/joint" for name in WATCHED)  # none but the curves
+    assert sorted(events.Tags()["scalars"]) == sorted(f"accuracy/{name}" for name in WATCHED)  # none but the curves

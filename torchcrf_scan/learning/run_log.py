@@ -30,7 +30,7 @@ GROUPS = {
 WATCHED = GROUPS["accuracy"]  # by the staged fit, which looks a few times only
 LAYOUT = {
     "what one watches": {
-        **{name: ["Multiline", [f"accuracy/{name}/.*"]] for name in WATCHED},
+        **{name: ["Multiline", [f"accuracy/{name}"]] for name in WATCHED},
         "objective": ["Multiline", ["objective/.*"]],
         "gradient": ["Multiline", ["gradient/.*"]],
     },
@@ -45,12 +45,14 @@ class RunLog:
         self.folder = folder
         self.writer = SummaryWriter(str(folder / "events"), purge_step=0)
         self.writer.add_custom_scalars(LAYOUT)
+        self.beside: dict[str, SummaryWriter] = {}
 
     def __enter__(self) -> RunLog:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.writer.close()
+        for writer in (self.writer, *self.beside.values()):
+            writer.close()
 
     def objective(self, tag: str, step: int, loss: float, slope: float) -> None:
         """One optimiser step of one chain: objective and gradient per node."""
@@ -65,10 +67,13 @@ class RunLog:
         for name, value in zip(names, weights.tolist(), strict=True):
             self.writer.add_scalar(f"weights/{name}", value, step)
 
-    def curves(self, method: str, summary: Mapping[str, float], step: int) -> None:
-        """The figures of `WATCHED` after a step of the fit."""
+    def curves(self, summary: Mapping[str, float], step: int, rival: str = "") -> None:
+        """The figures of `WATCHED` after a step of the fit, or those of a rival: a run of its own, drawn into the same charts."""
+        if rival and rival not in self.beside:
+            self.beside[rival] = SummaryWriter(str(self.folder / "events" / rival), purge_step=0)
+        writer = self.beside[rival] if rival else self.writer
         for name in WATCHED:
-            self.writer.add_scalar(f"accuracy/{name}/{method}", summary[name], step)
+            writer.add_scalar(f"accuracy/{name}", summary[name], step)
 
     def settings(self, settings: Mapping[str, Any], watched: Sequence[str]) -> None:
         """The settings of the run beside the last values of some of its scalars."""

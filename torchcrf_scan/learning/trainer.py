@@ -143,7 +143,7 @@ def show(
         run.picture(pairs[k], answers[k], last, f"{number:02d}_{pairs[k].name}")
     if watch is not None and not config.has_steps:
         watch.look_back(model, pairs)
-        run.settings(flatten(config), [f"accuracy/{name}/joint" for name in WATCHED] if pairs else [])
+        run.settings(flatten(config), [f"accuracy/{name}" for name in WATCHED] if pairs else [])
 
 
 def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], list[ScanPair]]:
