@@ -103,15 +103,18 @@ def changes(courses: Sequence[Course]) -> dict[str, tuple[Floats, Floats]]:
     """Step -> (T, 2) scores before and after it, of all rounds of all pairs."""
     scores = [of.scores for of in courses]
     ends = {name: (k, k + 1) for k, name in enumerate(STEPS)} | {ROUND: (0, len(STEPS))}
-    within = {name: tuple(np.concatenate([of[:, k] for of in scores]) for k in both) for name, both in ends.items()}
-    between = np.concatenate([of[:-1, -1] for of in scores]), np.concatenate([of[1:, 0] for of in scores])
-    return {**{name: (before, after) for name, (before, after) in within.items()}, BETWEEN: between}
+    found = {
+        name: (np.concatenate([of[:, a] for of in scores]), np.concatenate([of[:, b] for of in scores]))
+        for name, (a, b) in ends.items()
+    }
+    found[BETWEEN] = np.concatenate([of[:-1, -1] for of in scores]), np.concatenate([of[1:, 0] for of in scores])
+    return found
 
 
 def rise(before: Floats, after: Floats) -> Floats:
     """after - before; inf from impossible to possible, 0 from impossible to impossible."""
     still = np.isneginf(before) & np.isneginf(after)
-    return np.where(still, 0.0, np.where(still, 0.0, after) - np.where(still, 0.0, before))
+    return np.where(still, 0.0, after) - np.where(still, 0.0, before)
 
 
 def _change(before: Floats, after: Floats) -> tuple[float, ...]:
