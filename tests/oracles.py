@@ -10,6 +10,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import scipy.optimize
+import scipy.sparse
 
 KAPPA = 9.0
 ORDERS = (1, 3, 5)
@@ -55,6 +57,34 @@ def log_marginals(unary: np.ndarray, pairwise: np.ndarray, temperature: float = 
 
 def best_labelling(unary: np.ndarray, pairwise: np.ndarray) -> tuple[int, ...]:
     return max(labellings(unary), key=lambda labels: score(unary, pairwise, labels))
+
+
+def relaxed_best(unary: Sequence[np.ndarray], edges: dict[tuple[int, int], np.ndarray]) -> float:
+    """The largest score over the local polytope: the linear programming relaxation of the best labelling, on any graph.
+
+    unary: (S_i,) of every node; edges: (i, j) -> (S_i, S_j). An impossible state has no mass.
+    """
+    sizes = [len(of) for of in unary] + [table.size for table in edges.values()]
+    first = np.concatenate([[0], np.cumsum(sizes)])
+    gain = np.concatenate([*unary, *(table.ravel() for table in edges.values())])
+    rows = [(np.arange(first[i], first[i + 1]), np.ones(len(of)), 1.0) for i, of in enumerate(unary)]  # a node's mass is 1
+    for e, (ends, table) in enumerate(edges.items()):
+        cells = first[len(unary) + e] + np.arange(table.size).reshape(table.shape)
+        for node, lines in zip(ends, (cells, cells.T), strict=True):  # the mass of an edge sums to that of its ends
+            rows += [(np.append(line, first[node] + s), np.append(np.ones(len(line)), -1.0), 0.0) for s, line in enumerate(lines)]
+    counts = [len(where) for where, _, _ in rows]
+    places = np.repeat(np.arange(len(rows)), counts), np.concatenate([where for where, _, _ in rows])
+    sums = scipy.sparse.csr_array((np.concatenate([values for _, values, _ in rows]), places), shape=(len(rows), len(gain)))
+    possible = np.isfinite(gain)
+    most = np.stack([np.zeros(len(gain)), np.where(possible, np.inf, 0.0)], axis=1)
+    found = scipy.optimize.linprog(-np.where(possible, gain, 0.0), A_eq=sums, b_eq=[total for _, _, total in rows], bounds=most)
+    assert found.success, found.message
+    return -float(found.fun)
+
+
+def chain_edges(pairwise: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
+    """The edges of `relaxed_best` of a chain."""
+    return {(i, i + 1): table for i, table in enumerate(pairwise)}
 
 
 # Geometry.

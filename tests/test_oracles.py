@@ -46,6 +46,15 @@ def test_impossible_states() -> None:
     assert oracles.log_sum_exp([-math.inf, -math.inf]) == -math.inf
 
 
+def test_the_relaxation_is_tight_on_a_tree_and_loose_on_a_circle() -> None:
+    assert oracles.relaxed_best(list(UNARY), oracles.chain_edges(PAIRWISE)) == pytest.approx(4.0)
+    none, differ = [np.zeros(2)] * 3, 1.0 - np.eye(2)  # two of three neighbours on a circle are alike, but half of each is not
+    assert oracles.relaxed_best(none, {(0, 1): differ, (1, 2): differ}) == pytest.approx(2.0)
+    assert oracles.relaxed_best(none, {(0, 1): differ, (1, 2): differ, (2, 0): differ}) == pytest.approx(3.0)
+    impossible = [np.array([0.0, -np.inf]), np.zeros(2), np.array([0.0, -np.inf])]
+    assert oracles.relaxed_best(impossible, {(0, 1): differ, (1, 2): differ, (2, 0): differ}) == pytest.approx(2.0)
+
+
 def test_motion_and_angle() -> None:
     assert oracles.move((math.pi / 2, 1.0, 2.0), (3.0, 0.0)) == pytest.approx((1.0, 5.0))
     assert oracles.wrap(3 * math.pi / 2) == pytest.approx(-math.pi / 2)

@@ -61,6 +61,7 @@ POSITIONAL: Mapping[str, tuple[str, str | None, str]] = {  # parameter: metavar,
 
 FLAGS: Mapping[str, str] = {  # parameter that is true or false: help
     "causes": "also tell where wrong points come from, what became of every mover, and what oracles would save (method joint)",
+    "rounds": "also tell the joint objective after every step of the rounds, and whether they converge (method joint)",
     "use_odometry": "take the log's odometry as the first guess of the sensor's motion",
     "clean": "also write the log again without the beams that hit moving objects, and a bag with the odometry found",
     "visualize": "show everything in the viewer of rerun while it is computed (extra `viewer`)",

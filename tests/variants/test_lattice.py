@@ -49,7 +49,14 @@ from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.variants import sweep
-from torchcrf_scan.variants.lattice import LatticeBeliefs, lattice_beliefs, lattice_log_partition, lattice_messages
+from torchcrf_scan.variants.lattice import (
+    LatticeBeliefs,
+    lattice_beliefs,
+    lattice_bound,
+    lattice_log_partition,
+    lattice_messages,
+    lattice_score,
+)
 from torchcrf_scan.variants.lattice_features import (
     MOVING_WEIGHTS,
     LatticeFeatures,
@@ -77,6 +84,17 @@ def make_potentials(B: int, N: int, A: int, D: int, seed: int, *, impossible: bo
 
 def tables(potentials: LatticePotentials, b: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return oracles.lattice_tables(*(getattr(potentials, f.name)[b].detach().numpy() for f in fields(potentials)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_best_super_nodes_reach_the_value_of_the_relaxation(seed: int) -> None:
+    potentials = make_potentials(2, 4, 3, 3, seed, impossible=True)
+    states = lattice_beliefs(potentials, all_real(potentials.log_unary[..., 0])).best()
+    scores = lattice_score(potentials, *states)
+    assert_close(lattice_bound(potentials), scores)
+    for b in range(2):
+        unary, pairwise = tables(potentials, b)
+        assert float(scores[b]) == pytest.approx(oracles.relaxed_best(list(unary), oracles.chain_edges(pairwise)), abs=1e-7)
 
 
 def part(potentials: LatticePotentials, b: int, nodes: int) -> LatticePotentials:

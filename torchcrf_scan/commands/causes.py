@@ -31,14 +31,12 @@ class Traced:
     scores: Sequence[PairScore]
 
 
-def check(output: str | None, worst: int, causes: bool, method: str | None, others: Sequence[object]) -> None:
-    """Raises ValueError for options that do not go with `--causes`, or that need it. others: must be None with it."""
+def check(output: str | None, worst: int, causes: bool) -> None:
+    """Raises ValueError for options that need `--causes`."""
     if not causes and output is not None:
         raise ValueError(f"--output: expected none without --causes, got {output}")
     if worst < 0:
         raise ValueError(f"--worst: expected a number of pairs, 0 or more, got {worst}")
-    if causes and (method not in (None, "joint") or any(other is not None for other in others)):
-        raise ValueError("--causes: expected --method joint, no --predictions and no displaced frames beside it, got others")
 
 
 def trace(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Traced:

@@ -18,6 +18,7 @@ from torchcrf_scan.commands.arguments import batches, find_files, load_model, ma
 from torchcrf_scan.commands.causes import check as check_causes
 from torchcrf_scan.commands.causes import explain
 from torchcrf_scan.commands.frames import FrameOffset, Turn, match_displaced
+from torchcrf_scan.commands.rounds import tell_rounds
 from torchcrf_scan.commands.sequences import by_sequence, figures_of, rows_of, without_nan
 from torchcrf_scan.data.pair_file import read_pair, read_prediction
 from torchcrf_scan.model import JointScanCRF
@@ -61,6 +62,7 @@ def evaluate(
     frame_turn: Turn | None = None,
     seed: int = 0,
     causes: bool = False,
+    rounds: bool = False,
     worst: int = 6,
     output: str | None = None,
     candidates: int | None = None,
@@ -84,6 +86,7 @@ def evaluate(
         frame_turn: radians by which it is turned, exactly, to a random side; or any, uniform over the whole circle
         seed: seed of the random directions and sides
         causes: also where wrong points come from (joint alone)
+        rounds: also the course of the joint objective over the rounds, and whether they converge (joint alone)
         worst: with --causes, number of pairs with the most wrong points to name
         output: with --causes, folder for its tables (causes.md) and pictures of the worst pairs
         candidates: target points considered for each source point, 0 for all; by default as the model was saved
@@ -93,7 +96,8 @@ def evaluate(
     """
     _check_read(predictions, (method, model), (candidates, outlier_distance))
     displacement = _displacement(frame_offset, frame_turn, predictions)
-    check_causes(output, worst, causes, method, (predictions, displacement))
+    check_causes(output, worst, causes)
+    _check_joint({"--causes": causes, "--rounds": rounds}, method, (predictions, displacement))
     if json is not None:
         make_folder("--json", Path(json).parent)
     pairs = _annotated_pairs(pair_files)
@@ -107,6 +111,9 @@ def evaluate(
     if causes:
         more, counts = explain(load(), list(pairs.values()), worst, output)
         tables, figures = tables + more, figures | counts
+    if rounds:
+        more, courses = tell_rounds(load(), list(pairs.values()))
+        tables, figures = tables + more, figures | courses
     _tell(tables, figures, json)
     return 0
 
@@ -141,6 +148,13 @@ def _check_read(predictions: str | None, method: tuple[str | None, ...], setting
         raise ValueError("--predictions: expected no --method and no --model beside it, got both")
     if predictions is not None and any(given is not None for given in settings):
         raise ValueError("--predictions: expected no --candidates and no --outlier_distance beside it, as nothing is computed")
+
+
+def _check_joint(asked: dict[str, bool], method: str | None, others: tuple[object, ...]) -> None:
+    """Refuses what is told of the model's own answers alone, by option, beside another method. others: must be None."""
+    for option in [name for name, is_asked in asked.items() if is_asked]:
+        if method not in (None, "joint") or any(other is not None for other in others):
+            raise ValueError(f"{option}: expected --method joint, no --predictions and no displaced frames beside it, got others")
 
 
 def _displacement(metres: float | None, turn: Turn | None, predictions: str | None) -> FrameOffset | None:

@@ -183,6 +183,15 @@ def update_clusters(
     view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig
 ) -> State:
     """An exact pass over the clustering chain at fixed motions and associations."""
+    mask = view.batch.source_mask
+    unary, edges = clustering_at(view, start, state, found, parameters)
+    log_cluster = chain_beliefs(unary, edges, mask, config.temperature, in_loops=config.backend != "eager")
+    labels = cluster_labels(log_cluster.argmax(-1), log_cluster.shape[-1] - 1, mask)
+    return replace(state, log_cluster=log_cluster, cluster=labels)
+
+
+def clustering_at(view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters) -> tuple[Tensor, Tensor]:
+    """Log potentials (B, N, D) and (B, N-1, D, D) of the clustering chain at the state's motions and associations."""
     batch, scales = view.batch, parameters.scales
     at = clustering.correspond(batch.source, batch.target, state.motions.value, found.nearest, state.association)
     local = clustering_unary(view, at, state.motions.value, state.motions.active, scales, start.reach)
@@ -192,9 +201,7 @@ def update_clusters(
     unary, edges = clustering_potentials(local, pairwise, possible, parameters.clustering, extra)
     if view.limit is not None:
         unary = view.limit.joined(unary, clustering.nearest_distance(at, batch.target, found.nearest))
-    log_cluster = chain_beliefs(unary, edges, batch.source_mask, config.temperature, in_loops=config.backend != "eager")
-    labels = cluster_labels(log_cluster.argmax(-1), log_cluster.shape[-1] - 1, batch.source_mask)
-    return replace(state, log_cluster=log_cluster, cluster=labels)
+    return unary, edges
 
 
 def cluster_labels(best: Tensor, outlier: int, mask: Tensor) -> Tensor:
@@ -204,6 +211,15 @@ def cluster_labels(best: Tensor, outlier: int, mask: Tensor) -> Tensor:
 
 def update_association(view: PairView, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig) -> State:
     """An exact pass over the association chain, every point moved by its cluster's motion."""
+    mask = view.batch.source_mask
+    unary, edges = association_at(view, state, found, parameters)
+    log_association = chain_beliefs(unary, edges, mask, config.temperature, in_loops=config.backend != "eager")
+    labels = association_labels(log_association.argmax(-1), found.index, mask)
+    return replace(state, candidates=found.index, candidate_mask=found.mask, log_association=log_association, association=labels)
+
+
+def association_at(view: PairView, state: State, found: Candidates, parameters: Parameters) -> tuple[Tensor, Tensor]:
+    """Log potentials (B, N, K+1) and (B, N-1, K+1, K+1) of the association chain at the state's motions and clusters."""
     batch, scales, boosters = view.batch, parameters.scales, parameters.boosters
     states = AssociationStates.of(view, found.index, found.mask, scales, boosters)
     moved = registered_points(batch.source, state.motions.value, state.motions.active, state.log_cluster)
@@ -213,9 +229,7 @@ def update_association(view: PairView, state: State, found: Candidates, paramete
     unary, edges = association_potentials(unary, pairwise, found.mask, parameters.association, extra)
     if view.limit is not None:
         unary = view.limit.joined(unary, registered_distance(moved, batch.target, found.index))
-    log_association = chain_beliefs(unary, edges, batch.source_mask, config.temperature, in_loops=config.backend != "eager")
-    labels = association_labels(log_association.argmax(-1), found.index, batch.source_mask)
-    return replace(state, candidates=found.index, candidate_mask=found.mask, log_association=log_association, association=labels)
+    return unary, edges
 
 
 def associate(view: PairView, start: Start, cluster: Tensor, parameters: Parameters, config: InferenceConfig) -> Tensor:
@@ -276,13 +290,17 @@ def same_labels(a: State, b: State) -> Tensor:
     return (a.association == b.association).all(-1) & (a.cluster == b.cluster).all(-1)
 
 
+def swings(after: State, before: State, older: State) -> Tensor:
+    """(B,) whether the labels equal those of two rounds ago and not the last ones."""
+    return same_labels(after, older) & ~same_labels(after, before)
+
+
 def damp(after: State, before: State, older: State) -> State:
-    """Halves the motions' step if the labels equal those of two rounds ago (the guard against cycles of spec 7.6)."""
-    swings = same_labels(after, older) & ~same_labels(after, before)
+    """Halves the motions' step if the labels swing (the guard against cycles of spec 7.6)."""
     turn = se2.wrap(after.motions.value[..., :1] - before.motions.value[..., :1])
     half = before.motions.value + torch.cat([turn, after.motions.value[..., 1:] - before.motions.value[..., 1:]], -1) / 2
     damped = replace(after, motions=replace(after.motions, value=half))
-    return select_state(swings, damped, after)
+    return select_state(swings(after, before, older), damped, after)
 
 
 def has_settled(after: State, before: State, config: InferenceConfig) -> Tensor:

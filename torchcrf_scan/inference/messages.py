@@ -97,6 +97,14 @@ def pass_in_blocks(outgoing: Tensor, temperature: float) -> Tensor:
     return messages.flatten(1, 2)[:, :E]
 
 
+def chain_score(log_unary: Tensor, log_pairwise: Tensor, states: Tensor) -> Tensor:
+    """(B,) score of one labelling, the sum of its log potentials. states: (B, N). Others as in `chain_messages`."""
+    of_nodes = log_unary.gather(-1, states[..., None])[..., 0]
+    rows = log_pairwise.gather(2, states[:, :-1, None, None].expand(-1, -1, 1, log_pairwise.shape[3]))[:, :, 0]
+    of_edges = rows.gather(-1, states[:, 1:, None])[..., 0]
+    return of_nodes.sum(-1) + of_edges.sum(-1)
+
+
 def log_partition(log_unary: Tensor, log_pairwise: Tensor, temperature: float = 1.0) -> Tensor:
     """(B,) log of the summed (temperature 0: of the largest) score of all labellings. Arguments as in `chain_messages`.
 

@@ -32,7 +32,7 @@ from torchcrf_scan.features.potentials import (
     state_mask,
 )
 from torchcrf_scan.features.scales import Scales
-from torchcrf_scan.inference.messages import log_partition
+from torchcrf_scan.inference.messages import chain_score, log_partition
 from torchcrf_scan.inference.state import Parameters
 
 
@@ -127,10 +127,7 @@ class Chain:
         free = (~self.known).sum(-1).to(log_unary) * math.log(self.mask.shape[2])  # an unknown node adds log S to log Z
         both = self.known[:, 1:] & self.known[:, :-1]
         log_pairwise = (self.pairwise @ weights[split:]) * both[..., None, None]
-        of_nodes = log_unary.gather(-1, self.label[..., None])[..., 0]
-        rows = log_pairwise.gather(2, self.label[:, :-1, None, None].expand(-1, -1, 1, log_pairwise.shape[3]))[:, :, 0]
-        of_edges = rows.gather(-1, self.label[:, 1:, None])[..., 0]
-        return of_nodes.sum(-1) + of_edges.sum(-1) + free - log_partition(log_unary, log_pairwise)
+        return chain_score(log_unary, log_pairwise, self.label) + free - log_partition(log_unary, log_pairwise)
 
 
 def true_plugins(batch: ScanPairBatch, clusters: int) -> PlugIns:

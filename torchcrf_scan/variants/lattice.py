@@ -21,6 +21,7 @@ from torchcrf_scan.features.learned import add_log
 from torchcrf_scan.features.potentials import AssociationStates, PairView, possible_clusters
 from torchcrf_scan.inference.joint import association_labels, cluster_labels, update_motions
 from torchcrf_scan.inference.messages import normalise, normalise_beliefs, reduce_states
+from torchcrf_scan.inference.objective import dual_bound
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters, State
 from torchcrf_scan.variants.lattice_features import LatticePotentials, lattice_extra, lattice_features, transition_kinds
@@ -85,6 +86,28 @@ def lattice_beliefs(potentials: LatticePotentials, mask: Tensor, temperature: fl
         normalise_beliefs(reduce_states(beliefs, 3, temperature), temperature),
         normalise_beliefs(reduce_states(beliefs, 2, temperature), temperature),
     )
+
+
+def lattice_score(potentials: LatticePotentials, association: Tensor, cluster: Tensor) -> Tensor:
+    """(B,) score of one labelling. association, cluster: (B, N) states."""
+    A, D = potentials.log_unary.shape[2:]
+    j, k = association, cluster
+    kind = transition_kinds(D, k.device)[k[:, :-1], k[:, 1:]]
+    states = (
+        (potentials.log_unary.flatten(2), j * D + k),
+        (potentials.log_association.flatten(2), (j[:, :-1] * A + j[:, 1:]) * 3 + kind),
+        (potentials.log_cluster.flatten(2), k[:, :-1] * D + k[:, 1:]),
+    )
+    return torch.stack([values.gather(-1, state[..., None]).sum((1, 2)) for values, state in states]).sum(0)
+
+
+def lattice_bound(potentials: LatticePotentials) -> Tensor:
+    """(B,) `inference.objective.dual_bound` of the chain of super-nodes at its max-product messages."""
+    kinds = transition_kinds(potentials.log_cluster.shape[-1], potentials.log_cluster.device)
+    factors = zip(potentials.log_association.unbind(1), potentials.log_cluster.unbind(1), strict=True)
+    tables = ((by_kind[..., kinds] + between[:, None, None]).transpose(2, 3) for by_kind, between in factors)  # (B, A, D, A', D')
+    edges = (table.flatten(3).flatten(1, 2) for table in tables)
+    return dual_bound(potentials.log_unary.flatten(2), edges, lattice_messages(potentials)[0].flatten(2))
 
 
 def lattice_log_partition(potentials: LatticePotentials) -> Tensor:
@@ -160,22 +183,27 @@ def update_labels(
     view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters, config: InferenceConfig
 ) -> State:
     """An exact pass over the chain of super-nodes, which decides both labels of a point at once (spec 7.7)."""
-    batch, motions = view.batch, state.motions
-    states = AssociationStates.of(view, found.index, found.mask, parameters.scales, parameters.boosters)
-    possible = possible_clusters(motions.active, view.within(start.reach), batch.source.shape[1])
-    fitted = parameters.scales, parameters.boosters
-    features = lattice_features(view, states, motions.value, found.nearest, possible, *fitted, start.reach)
-    potentials = features.potentials(torch.cat([parameters.association, parameters.clustering]))
-    extra = lattice_extra(view.learned, found.index, possible.shape[-1])
-    potentials = replace(potentials, log_unary=add_log(potentials.log_unary, extra))
-    beliefs = lattice_beliefs(potentials, batch.source_mask, config.temperature)
+    mask = view.batch.source_mask
+    potentials = lattice_at(view, start, state, found, parameters)
+    beliefs = lattice_beliefs(potentials, mask, config.temperature)
     place, cluster = beliefs.best()
     return replace(
         state,
-        association=association_labels(place, found.index, batch.source_mask),
-        cluster=cluster_labels(cluster, possible.shape[-1] - 1, batch.source_mask),
+        association=association_labels(place, found.index, mask),
+        cluster=cluster_labels(cluster, beliefs.log_cluster.shape[-1] - 1, mask),
         candidates=found.index,
         candidate_mask=found.mask,
         log_association=beliefs.log_association,
         log_cluster=beliefs.log_cluster,
     )
+
+
+def lattice_at(view: PairView, start: Start, state: State, found: Candidates, parameters: Parameters) -> LatticePotentials:
+    """The lattice's log potentials at the state's motions."""
+    motions, fitted = state.motions, (parameters.scales, parameters.boosters)
+    states = AssociationStates.of(view, found.index, found.mask, *fitted)
+    possible = possible_clusters(motions.active, view.within(start.reach), view.batch.source.shape[1])
+    features = lattice_features(view, states, motions.value, found.nearest, possible, *fitted, start.reach)
+    potentials = features.potentials(torch.cat([parameters.association, parameters.clustering]))
+    extra = lattice_extra(view.learned, found.index, possible.shape[-1])
+    return replace(potentials, log_unary=add_log(potentials.log_unary, extra))

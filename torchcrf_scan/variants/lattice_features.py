@@ -75,6 +75,10 @@ class LatticePotentials:
     log_association: Tensor
     log_cluster: Tensor
 
+    def double(self) -> LatticePotentials:
+        """The same in float64."""
+        return LatticePotentials(self.log_unary.double(), self.log_association.double(), self.log_cluster.double())
+
     def cut(self, known: Tensor) -> LatticePotentials:
         """Unknown nodes (False in known: (B, N)) become padding, without their edges."""
         edge = (known[:, 1:] & known[:, :-1])[..., None, None]

@@ -16,7 +16,7 @@ from torchcrf_scan.features.scales import Scales
 from torchcrf_scan.inference.pseudo_likelihood import Design, PlugIns, at_true_neighbours, beside_true_neighbours, states_with_truth
 from torchcrf_scan.inference.state import Parameters
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
-from torchcrf_scan.variants.lattice import lattice_log_partition
+from torchcrf_scan.variants.lattice import lattice_log_partition, lattice_score
 from torchcrf_scan.variants.lattice_features import (
     ASSOCIATION_PAIRWISE,
     CLUSTER_PAIRWISE,
@@ -25,7 +25,6 @@ from torchcrf_scan.variants.lattice_features import (
     MOVING_WEIGHTS,
     STATIC_WEIGHTS,
     LatticeFeatures,
-    LatticePotentials,
     lattice_extra,
     lattice_features,
     transition_kinds,
@@ -86,19 +85,7 @@ class LatticeChain(LatticeFeatures):
         potentials = replace(potentials, log_unary=add_log(potentials.log_unary, self.extra)).cut(self.known)
         states = self.mask.shape[2] * self.mask.shape[3]
         free = (~self.known).sum(-1).to(potentials.log_unary) * math.log(states)  # an unknown node adds log A D to log Z
-        return self._score(potentials) + free - lattice_log_partition(potentials)
-
-    def _score(self, potentials: LatticePotentials) -> Tensor:
-        """(B,) score of the true labels."""
-        A, D = self.mask.shape[2:]
-        j, k = self.association, self.cluster
-        kind = transition_kinds(D, k.device)[k[:, :-1], k[:, 1:]]
-        states = (
-            (potentials.log_unary.flatten(2), j * D + k),
-            (potentials.log_association.flatten(2), (j[:, :-1] * A + j[:, 1:]) * 3 + kind),
-            (potentials.log_cluster.flatten(2), k[:, :-1] * D + k[:, 1:]),
-        )
-        return torch.stack([values.gather(-1, state[..., None]).sum((1, 2)) for values, state in states]).sum(0)
+        return lattice_score(potentials, self.association, self.cluster) + free - lattice_log_partition(potentials)
 
 
 def lattice_chain(view: PairView, plugins: PlugIns, scales: Scales, boosters: Boosters, config: InferenceConfig) -> LatticeChain:
