@@ -1,13 +1,16 @@
 """What is written to the run folder, read back with TensorBoard's own reader."""
 
+import errno
+import threading
 from pathlib import Path
 
+import pytest
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
 
 from torchcrf_scan.evaluation.table import Table
-from torchcrf_scan.learning.run_log import WATCHED, RunLog
+from torchcrf_scan.learning.run_log import WATCHED, RunLog, one_error
 
 
 def read(folder: Path) -> EventAccumulator:
@@ -54,3 +57,40 @@ def test_settings_of_a_staged_run_stand_beside_its_last_figures(tmp_path: Path) 
     assert settings["learning.prior"].number_value == 10.0
     assert settings["data.simulate_train"].string_value == "('street',)"
     assert sorted(events.Tags()["scalars"]) == sorted(f"accuracy/{name}" for name in WATCHED)  # none but the curves
+
+
+def test_a_full_disk_is_one_error_that_names_the_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """TensorBoard's thread says nothing of it; a thread of somebody else still does."""
+
+    def fail() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    writer = type("Writer", (threading.Thread,), {"__module__": "tensorboard.summary.writer"})
+    before = threading.excepthook
+    with one_error(tmp_path / "run"):
+        run_to_its_end(writer(target=fail))
+    assert capsys.readouterr().err == ""
+    with pytest.raises(OSError, match=r"No space left on device: '.*run'"), one_error(tmp_path / "run"):
+        fail()
+    assert threading.excepthook is before
+    named = OSError(errno.ENOENT, "No such file or directory", "weights")
+    with pytest.raises(OSError, match="'weights'"), one_error(tmp_path / "run"):
+        raise named
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_other_threads_still_tell_their_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", told.append)
+
+    def fail() -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with one_error(tmp_path):
+        run_to_its_end(threading.Thread(target=fail))
+    assert len(told) == 1
+
+
+def run_to_its_end(thread: threading.Thread) -> None:
+    thread.start()
+    thread.join()

@@ -26,7 +26,7 @@ from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning.leaks import TrainedOn
-from torchcrf_scan.learning.run_log import RunLog
+from torchcrf_scan.learning.run_log import RunLog, one_error
 from torchcrf_scan.scan import Ints, PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_associations, save_figure
 from torchcrf_scan.viz.sequences import consecutive, plot_association_sequence, plot_cluster_sequence
@@ -70,7 +70,7 @@ def run_experiment(config: RunConfig) -> dict[str, list[Table]]:
     if rank_and_world()[0] != 0:
         return {}
     tables = {}
-    with RunLog(folder) as run:
+    with one_error(folder), RunLog(folder) as run:
         for protocol, of_protocol in folds.items():
             results = read_folds(folder / "folds" / protocol, pairs, of_protocol)
             scores = score(results)

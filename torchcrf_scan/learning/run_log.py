@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -36,6 +38,29 @@ LAYOUT = {
     },
     "weights": {chain: ["Multiline", [f"weights/{chain}/.*"]] for chain in ("association", "clustering")},
 }  # of the staged fit, for TensorBoard's custom scalars: one chart with many lines each
+
+
+@contextmanager
+def one_error(folder: Path) -> Iterator[None]:
+    """Makes a failed write of events one error that names the run folder.
+
+    TensorBoard writes in a thread, which prints its own traceback of a full disk before the next event raises the same error here.
+    """
+    before = threading.excepthook
+
+    def hook(told: threading.ExceptHookArgs) -> None:
+        if not (isinstance(told.exc_value, OSError) and type(told.thread).__module__.startswith("tensorboard.")):
+            before(told)
+
+    threading.excepthook = hook
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            raise OSError(error.errno, error.strerror, str(folder)) from error
+        raise
+    finally:
+        threading.excepthook = before
 
 
 class RunLog:

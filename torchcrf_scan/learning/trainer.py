@@ -40,7 +40,7 @@ from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.learning.monitor import TrainingMonitor
 from torchcrf_scan.learning.own_start import own_starts, start_anew
 from torchcrf_scan.learning.ranks import ALONE, Ranks, join
-from torchcrf_scan.learning.run_log import WATCHED, RunLog
+from torchcrf_scan.learning.run_log import WATCHED, RunLog, one_error
 from torchcrf_scan.learning.selection_fit import fit_potential
 from torchcrf_scan.learning.settings import AugmentConfig, Config, DataConfig
 from torchcrf_scan.learning.staged_watch import StagedWatch
@@ -65,7 +65,7 @@ def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]
     Args:
         resume: continue from the checkpoint in the run folder if there is one; else start anew.
     """
-    with join(config.gradient.device if config.has_steps else "cpu") as ranks:
+    with one_error(Path(config.output)), join(config.gradient.device if config.has_steps else "cpu") as ranks:
         return train_together(config, ranks, resume=resume)
 
 
