@@ -11,7 +11,7 @@ from torchcrf_scan import JointScanCRF
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning import own_laser
-from torchcrf_scan.learning.own_laser import calibrate_on, folds_of, gains, moved_towards, surprise, wrong_points
+from torchcrf_scan.learning.own_laser import calibrate_on, folds_of, gains, moved_towards, named, surprise, wrong_points
 from torchcrf_scan.scan import OUTLIER, ScanPair
 
 GATE = 0.1  # metres: the convention of the annotation made up here
@@ -88,7 +88,7 @@ def test_a_gain_must_exceed_its_standard_error() -> None:
 def test_shares_lead_from_the_model_s_values_to_the_fitted_ones() -> None:
     fitted = JointScanCRF().scales
     for share in (0.0, 1.0):
-        moved = moved_towards(shipped(), "scales", fitted, share).scales.state_dict()
+        moved = moved_towards(shipped(), named("scales", fitted), share).scales.state_dict()
         expected = (fitted if share else shipped().scales).state_dict()
         for name, value in moved.items():
             torch.testing.assert_close(value, expected[name].to(value))
