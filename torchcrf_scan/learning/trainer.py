@@ -304,7 +304,7 @@ def pairs_to_draw(pairs: Sequence[ScanPair], most: int = 4) -> list[int]:
 
 def write_results(folder: Path, scores: dict[str, list[PairScore]], tables: Sequence[Table]) -> None:
     """Writes `metrics.json`, `tables.md` and `versions.json`, each atomically."""
-    metrics = {method: summarise(of_method) for method, of_method in scores.items()}
+    metrics = {method: summarise(of_method) for method, of_method in scores.items() if of_method}
     contents = {
         "metrics.json": json.dumps(metrics, indent=2) + "\n",
         "tables.md": "\n\n".join(table.to_markdown() for table in tables) + "\n",
