@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"train.py: error: {one_line(error)}", file=sys.stderr)
         return 1
     if int(os.environ.get("RANK", 0)) == 0:  # the first process of torchrun
-        for table in report(scores):
+        for table in report(scores) if any(scores.values()) else ():  # without test pairs there is nothing to tell
             print(table.to_markdown(), end="\n\n")
         print(f"run folder: {config.output}  (tensorboard --logdir {config.output})")
     return 0

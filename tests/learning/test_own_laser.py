@@ -11,7 +11,8 @@ from torchcrf_scan import JointScanCRF
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning import own_laser
-from torchcrf_scan.learning.own_laser import calibrate_on, folds_of, gains, moved_towards, surprise, wrong_points
+from torchcrf_scan.learning.own_laser import calibrate_on, folds_of, gains, moved_towards, named, surprise, wrong_points
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.scan import OUTLIER, ScanPair
 
 GATE = 0.1  # metres: the convention of the annotation made up here
@@ -88,7 +89,7 @@ def test_a_gain_must_exceed_its_standard_error() -> None:
 def test_shares_lead_from_the_model_s_values_to_the_fitted_ones() -> None:
     fitted = JointScanCRF().scales
     for share in (0.0, 1.0):
-        moved = moved_towards(shipped(), "scales", fitted, share).scales.state_dict()
+        moved = moved_towards(shipped(), named("scales", fitted), share).scales.state_dict()
         expected = (fitted if share else shipped().scales).state_dict()
         for name, value in moved.items():
             torch.testing.assert_close(value, expected[name].to(value))
@@ -116,3 +117,25 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
         calibrate_on(shipped(), annotated()[:1])
     with pytest.raises(ValueError, match="two or more annotated pairs"):
         calibrate_on(shipped(), [replace(pair, annotation=None) for pair in annotated()])
+
+
+def test_weights_go_from_the_model_s_own_as_far_as_pairs_left_out_gain() -> None:
+    """A model whose weights were disturbed finds back; the encoder's potentials count, and nothing but the weights moves."""
+    model, learning = JointScanCRF.from_pretrained(), LearningConfig(objective="likelihood", predicted_share=0.5, prior=0.3)
+    with torch.no_grad():
+        model.association_weights["registered_translation"].mul_(0.1)
+    pairs = annotated()
+    fitted, part = own_laser.fit_own_weights(model, pairs, folds_of(pairs), learning)
+    assert part.is_kept
+    assert part.after < part.before
+    changed = {name for name, value in fitted.state_dict().items() if not torch.equal(value, model.state_dict()[name])}
+    assert "association_weights.registered_translation" in changed
+    assert all(name.startswith(("association_weights.", "clustering_weights.")) for name in changed)
+    kept, _ = own_laser.fit_own_weights(model, pairs, folds_of(pairs), replace(learning, prior=1e-6))
+    for name, value in kept.state_dict().items():
+        torch.testing.assert_close(value, model.state_dict()[name], rtol=1e-3, atol=1e-4)
+
+
+def test_calibration_begins_with_the_weights_if_asked() -> None:
+    _, parts = calibrate_on(shipped(), annotated(3), LearningConfig(prior=0.01, max_steps=2))
+    assert [part.name for part in parts][:2] == ["weights", "outlier distance"]

@@ -12,6 +12,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
+from torchcrf_scan.data.pair_file import write_pair
+from torchcrf_scan.data.simulate import simulate_pairs
+from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning.leaks import TrainedOn
 from torchcrf_scan.learning.run_log import WATCHED
 from torchcrf_scan.learning.settings import DataConfig
@@ -211,3 +214,19 @@ def test_bad_settings_are_bad_usage(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert left.value.code == 2
     assert "error: data.pairs: expected a whole number in [1, 100000], got 0" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_a_shipped_model_is_fitted_to_a_few_pairs(tmp_path: Path) -> None:
+    """The settings `mine.yaml`: no staged fit, the encoder stays, and the model that comes out is a whole one."""
+    (tmp_path / "pairs").mkdir()
+    pairs = simulate_pairs(SimulatorConfig(beams=61), 3, 3, 40)
+    made = {pair.sequence for pair in pairs}
+    for pair in pairs:
+        write_pair(tmp_path / "pairs" / f"{pair.name}.npz", pair)
+    options = [f"--config={ROOT / 'configs' / 'mine.yaml'}", f"--data.train={tmp_path / 'pairs'}", "--learning.max_steps=2"]
+    assert load_main()([*options, f"--output={tmp_path / 'run'}"]) == 0
+    before, after = JointScanCRF.from_pretrained(), JointScanCRF.from_pretrained(tmp_path / "run" / "model")
+    for name, value in before.state_dict().items():
+        if name.startswith(("encoder.", "boosters.")):
+            assert torch.equal(after.state_dict()[name], value), name
+    assert {*TrainedOn.of_model(tmp_path / "run" / "model").sequences} == {*TrainedOn.of_model("encoder").sequences, *made}

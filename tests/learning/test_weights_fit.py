@@ -1,5 +1,6 @@
 """The convex part: the optimum of a conditional logit, whatever the units of its features."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -137,3 +138,35 @@ def test_flatten_keeps_known_nodes_and_the_outlier_last() -> None:
     weights = normal(2)
     expected = torch.cat([design.log_likelihood(weights)[design.known] for design in designs])
     assert_close(flat.log_likelihood(weights)[0], expected)
+
+
+def test_a_prior_around_weights_leaves_them_where_nothing_is_told() -> None:
+    """A narrow prior keeps its mean, a wide one finds what no mean finds; dead weights stay at the mean."""
+    design, truth = make_design()
+    around = truth + 1.0
+    narrow = fit_weights(design, replace(EXACT, prior=1e-4), around=around)
+    assert_close(narrow, around, tolerance=1e-3)
+    wide = fit_weights(design, replace(EXACT, prior=100.0), around=around)
+    assert_close(wide, fit_weights(design, replace(EXACT, prior=100.0)), tolerance=1e-3)
+    live = torch.tensor([1.0, 0.0, 1.0, 1.0]).double()
+    assert fit_weights(design, replace(EXACT, prior=100.0), live=live, around=around)[1] == around[1]
+
+
+def test_the_prior_pulls_towards_its_mean_as_newton_says() -> None:
+    """In units of the features' spread: the same optimum as of weights less the mean, with the mean's score as extra potentials."""
+    design, truth = make_design()
+    shifted = Design(design.features, design.mask, design.label, design.known, design.features @ truth)
+    config = replace(EXACT, prior=0.05)
+    assert_close(fit_weights(design, config, around=truth), truth + fit_weights(shifted, config), tolerance=1e-5)
+
+
+def test_flatten_keeps_extra_potentials_beside_their_states() -> None:
+    """Of batches with other numbers of states, the outlier last; 0 where there are none."""
+    wide, _ = make_design(nodes=3, states=5)
+    narrow, _ = make_design(nodes=2, states=3, seed=1)
+    extra = normal(1, 2, 3, seed=2)
+    both = flatten([wide, replace(narrow, extra=extra)])
+    assert both.extra is not None
+    assert (both.extra[0, :3] == 0).all()
+    assert_close(both.extra[0, 3:][:, [0, 1, 4]], extra[0])
+    assert (both.extra[0, 3:, 2:4] == 0).all()

@@ -95,7 +95,7 @@ class Chain:
         axes, labels: the tensors' axes after B (n nodes, e edges, s states), and the states that a label indexes; for stacking.
     """
 
-    axes: ClassVar[dict[str, str]] = {"unary": "ns", "pairwise": "ess", "mask": "ns", "label": "n", "known": "n"}
+    axes: ClassVar[dict[str, str]] = {"unary": "ns", "pairwise": "ess", "mask": "ns", "label": "n", "known": "n", "extra": "ns"}
     labels: ClassVar[dict[str, str]] = {"label": "s"}
 
     unary: Tensor

@@ -82,6 +82,21 @@ def fit(
     return margins
 
 
+def refit(model: JointScanCRF, material: Sequence[Material], config: LearningConfig) -> None:
+    """Fits the weights of a model with both chains anew, in place, around its own: they are the mean of the prior.
+
+    Scales, boosters, encoder and the worth of movers stay.
+    """
+    generator = torch.Generator().manual_seed(config.seed)
+    association, clustering = (of.detach().double() for of in model.weight_vectors)
+    lessons = [prepare(model, part, config, generator) for part in material]
+    margins = {lesson.fold: model.boosters for lesson in lessons}
+    fit_association(model, lessons, margins, config, None, association)
+    predicted = [predict_association(model, lesson, model.boosters) for lesson in lessons]
+    features = (clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True))
+    set_weights(model, "clustering", fit_chain(features, live_weights(model.config.features)[1], config, None, clustering))
+
+
 def fit_features(
     model: JointScanCRF,
     lessons: Sequence[Lesson],
@@ -101,12 +116,17 @@ def fit_features(
 
 
 def fit_association(
-    model: JointScanCRF, lessons: Sequence[Lesson], margins: Margins, config: LearningConfig, watch: Watch | None
+    model: JointScanCRF,
+    lessons: Sequence[Lesson],
+    margins: Margins,
+    config: LearningConfig,
+    watch: Watch | None,
+    around: Tensor | None = None,
 ) -> None:
-    """Fits the weights of the association chain, with out-of-fold margins."""
+    """Fits the weights of the association chain, with out-of-fold margins. around: as in `fit_chain`."""
     make = pseudo_likelihood.association_chain if LOSSES[config.objective].is_exact else pseudo_likelihood.association_design
     features = (make(of.view, of.plugins, model.scales, margins[of.fold], model.config.inference) for of in lessons)
-    set_weights(model, "association", fit_chain(features, live_weights(model.config.features)[0], config, watch))
+    set_weights(model, "association", fit_chain(features, live_weights(model.config.features)[0], config, watch, around))
 
 
 def fit_one_chain(
@@ -128,7 +148,8 @@ def fit_one_chain(
 
 def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generator: torch.Generator) -> Lesson:
     """The training plug-ins of one batch; for CRF-Matching every point moves with the background."""
-    view = model.view(part.batch)
+    with torch.no_grad():
+        view = model.view(part.batch, model.learned_inputs(part.batch, part.start))
     start = view.in_unit(part.start)
     plugins = training_plugins(view.batch, start, config, generator)
     if not model.config.has_clusters:

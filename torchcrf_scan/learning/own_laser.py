@@ -1,4 +1,4 @@
-"""Fits a saved model to one laser on a few annotated pairs: distance of outliers, scales, movers' worth, confidences.
+"""Fits a saved model to one laser on a few annotated pairs: weights, distance of outliers, scales, movers' worth, confidences.
 
 Few pairs must not make a model worse. Every part is fitted on some of the pairs and measured on those left out, in turn, at
 several shares of the way from the model's own values to the fitted ones; it is kept, at the best share, only where the pairs left
@@ -9,21 +9,23 @@ the model with those before it. For the distance, one number with a sharp optimu
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.evaluation.calibration import rightness
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.inference.uncertainty import WITHIN
 from torchcrf_scan.learning.calibration_fit import Judged, fit_confidence, judge
+from torchcrf_scan.learning.fit import refit
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.learning.scales_fit import fit_scales
 from torchcrf_scan.learning.selection_fit import fit_potential, judge_clusters
+from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import Floats, ScanPair
 
@@ -34,7 +36,8 @@ DISTANCES = tuple(0.02 * 1.2**k for k in range(28))  # metres, up to 2.7
 AGAIN = (0.25, 0.5, 0.25)  # weights of a distance's errors and its neighbours': one pair must not pick a lucky one
 IN_LOGARITHMS = ("local", "pairwise", "cluster_distance", "outlier_threshold", "gate", "neighbour_weight", "neighbour_distance")
 
-Fit = Callable[[JointScanCRF, Sequence[ScanPair]], nn.Module | None]  # a part's fitted values; None: too little to fit on
+Values = Mapping[str, Tensor]  # by their name in the model's state
+Fit = Callable[[JointScanCRF, Sequence[ScanPair]], Values | None]  # a part's fitted values; None: too little to fit on
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +57,13 @@ class Part:
     is_kept: bool
 
 
-def calibrate_on(model: JointScanCRF, pairs: Sequence[ScanPair]) -> tuple[JointScanCRF, list[Part]]:
+def calibrate_on(
+    model: JointScanCRF, pairs: Sequence[ScanPair], learning: LearningConfig | None = None
+) -> tuple[JointScanCRF, list[Part]]:
     """The model fitted to the laser of annotated pairs, and what each part gains on pairs left out.
+
+    Args:
+        learning: settings of a fit of the weights around the model's own, before everything else; None: they stay.
 
     Raises:
         ValueError: fewer than two pairs, one without annotation, or a model of one chain.
@@ -66,6 +74,9 @@ def calibrate_on(model: JointScanCRF, pairs: Sequence[ScanPair]) -> tuple[JointS
         raise ValueError(f"chains: expected joint for a model to calibrate, got {model.config.chains}")
     folds = folds_of(pairs)
     found = []
+    if learning is not None:
+        model, part = fit_own_weights(model, pairs, folds, learning)
+        found.append(part)
     for fit in (fit_distance, fit_own_scales, fit_worth, fit_confidences):
         model, part = fit(model, pairs, folds)
         found.append(part)
@@ -131,63 +142,81 @@ def fit_distance(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence
     return (with_distance(model, metres) if is_kept else model), part
 
 
+def fit_own_weights(
+    model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]], learning: LearningConfig
+) -> tuple[JointScanCRF, Part]:
+    """The weights of both chains by `fit.refit`, around the model's own."""
+
+    def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> Values | None:
+        batch, other = ScanPairBatch.collate(some), copy.deepcopy(of)
+        refit(other, [Material(batch, of.initialise(batch.without_truth()), 0, tuple(some))], learning)
+        return named("association_weights", other.association_weights) | named("clustering_weights", other.clustering_weights)
+
+    return fit_by_share(model, pairs, folds, "weights", fit)
+
+
 def fit_own_scales(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
     """The features' scales by `scales_fit`."""
 
-    def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> nn.Module | None:
+    def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> Values | None:
         view = of.view(ScanPairBatch.collate(some))
         plugins = true_plugins(view.batch, of.config.motions)
         has_pairs = view.batch.truth is not None and bool((view.batch.truth.association >= 0).any())
-        return fit_scales([view], [plugins]) if has_pairs else None
+        return named("scales", fit_scales([view], [plugins])) if has_pairs else None
 
-    return fit_by_share(model, pairs, folds, "scales", "scales", fit)
+    return fit_by_share(model, pairs, folds, "scales", fit)
 
 
 def fit_worth(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
     """The movers' worth by `selection_fit`."""
 
-    def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> nn.Module | None:
+    def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> Values | None:
         batch = ScanPairBatch.collate(some)
         start = of.initialise(batch.without_truth())
         material = Material(batch, start, 0, tuple(some))
         is_true = judge_clusters(of, material)[1] if start.log_odds is not None else torch.zeros(0)
         has_both = min(int((is_true == label).sum()) for label in (0, 1)) >= FEWEST_MOVERS
-        return fit_potential(of, [material]) if has_both else None
+        return named("cluster_potential", fit_potential(of, [material])) if has_both else None
 
-    return fit_by_share(model, pairs, folds, "movers' worth", "cluster_potential", fit)
+    return fit_by_share(model, pairs, folds, "movers' worth", fit)
 
 
 def fit_by_share(
-    model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]], name: str, module: str, fit: Fit
+    model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]], name: str, fit: Fit
 ) -> tuple[JointScanCRF, Part]:
-    """A module of the model fitted on all pairs, at the share of the way that leaves the fewest wrong points on those left out."""
+    """A part of the model fitted on all pairs, at the share of the way that leaves the fewest wrong points on those left out."""
     before = errors(model, pairs)
     after = np.tile(before, (len(SHARES), 1, 1))
     for fold in folds:
         fitted = fit(model, [pair for k, pair in enumerate(pairs) if k not in fold])
-        for row, share in enumerate(SHARES if fitted is not None else ()):
-            after[row, fold] = errors(moved_towards(model, module, fitted, share), [pairs[k] for k in fold])
+        for row, share in enumerate(SHARES):
+            if fitted is not None:
+                after[row, fold] = errors(moved_towards(model, fitted, share), [pairs[k] for k in fold])
     best = int(after[..., 0].sum(1).argmin())
     fitted = fit(model, pairs)
     is_safe = bool(after[best, :, 2].sum() <= before[:, 2].sum())
     is_kept = fitted is not None and is_safe and gains(before[:, 0], after[best, :, 0])
     told = "too few examples" if fitted is None else f"{100 * SHARES[best]:.0f} % of the way"
     part = Part(name, "wrong points", before[:, 0].sum(), after[best, :, 0].sum(), told, is_kept)
-    return (moved_towards(model, module, fitted, SHARES[best]) if is_kept else model), part
+    return (moved_towards(model, fitted, SHARES[best]) if fitted is not None and is_kept else model), part
+
+
+def named(module: str, fitted: nn.Module) -> dict[str, Tensor]:
+    """The state of a module of a model, by the names that it has there."""
+    return {f"{module}.{name}": value for name, value in fitted.state_dict().items()}
 
 
 @torch.no_grad()
-def moved_towards(model: JointScanCRF, module: str, fitted: nn.Module | None, share: float) -> JointScanCRF:
-    """A copy of the model with the buffers of a module a share of the way to the fitted ones; scales in logarithms."""
-    assert fitted is not None
+def moved_towards(model: JointScanCRF, fitted: Values, share: float) -> JointScanCRF:
+    """A copy of the model with some values a share of the way to the fitted ones; scales in logarithms."""
     other = copy.deepcopy(model)
-    values = fitted.state_dict()
-    for name, own in getattr(other, module).named_buffers():
-        target = values[name].to(own)
-        if module == "scales" and name in IN_LOGARITHMS:
-            own.copy_((own.log() * (1 - share) + target.log() * share).exp())
+    own = other.state_dict()
+    for name, value in fitted.items():
+        target = value.to(own[name])
+        if name.removeprefix("scales.") in IN_LOGARITHMS:
+            own[name].copy_((own[name].log() * (1 - share) + target.log() * share).exp())
         else:
-            own.copy_(own * (1 - share) + target * share)
+            own[name].copy_(own[name] * (1 - share) + target * share)
     return other
 
 

@@ -221,7 +221,9 @@ class Config:
         overfit: train and test on the first training pair alone, a quick check that everything can learn.
         compare_chains: also fit and evaluate CRF-Matching and CRF-Clustering alone.
         init: a model, as a folder or by the name of a shipped one, with the initial weights of first-order training; none: those
-            of the staged fit. The sequences that it was trained on (`learning.leaks`) must not be tested.
+            of the staged fit. Without first-order training it is fitted to the training pairs (`learning.own_laser`): weights
+            around its own, with the prior `learning.prior`, and every part of `torchcrf-scan calibrate`, where pairs left out
+            gain. The sequences that it was trained on (`learning.leaks`) must not be tested.
     """
 
     data: DataConfig = field(default_factory=DataConfig)
@@ -239,8 +241,6 @@ class Config:
         other, staged = self.gradient.objective, self.learning.objective
         if not LOSSES[staged].is_staged and other not in (NO_STEPS, staged):
             raise ValueError(f"gradient.objective: expected {staged} with learning.objective {staged}, got {other}")
-        if self.init and not self.has_steps:
-            raise ValueError(f"init: expected a gradient.objective to go on with from {self.init}, got none")
 
     @property
     def first_order(self) -> str:

@@ -38,6 +38,7 @@ from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.leaks import TrainedOn
 from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.learning.monitor import TrainingMonitor
+from torchcrf_scan.learning.own_laser import calibrate_on
 from torchcrf_scan.learning.own_start import own_starts, start_anew
 from torchcrf_scan.learning.ranks import ALONE, Ranks, join
 from torchcrf_scan.learning.run_log import WATCHED, RunLog, one_error
@@ -97,7 +98,8 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
     with RunLog(folder) if ranks.is_first else nullcontext() as run:
         model = JointScanCRF(config.model)
         watch = StagedWatch(run) if run is not None else None
-        material = prepare(model, train_pairs, config, watch, state) if watch is not None else []
+        is_fitted_before = bool(config.init) and not config.has_steps
+        material = prepare(model, train_pairs, config, watch, state) if watch is not None and not is_fitted_before else []
         if config.has_steps:
             ranks.share_weights(model)
             first_step = state["step"] + 1 if state else None
@@ -108,8 +110,11 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
             is_joint = model.config.has_association and model.config.has_clusters
             if config.has_steps and config.gradient.refit_potential and is_joint:
                 model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
-            calibrate(model, material)
-            cascade = fit_baselines(material, config, run)
+            if is_fitted_before:
+                model = fit_own(model, train_pairs, config)
+            else:
+                calibrate(model, material)
+                cascade = fit_baselines(material, config, run)
             model.save_pretrained(folder / "model")
             trained_on.write(folder / "model")
             log.info("fitted in %.0f s", time.perf_counter() - began)
@@ -143,7 +148,17 @@ def show(
         run.picture(pairs[k], answers[k], last, f"{number:02d}_{pairs[k].name}")
     if watch is not None and not config.has_steps:
         watch.look_back(model, pairs)
-        run.settings(flatten(config), [f"accuracy/{name}" for name in WATCHED] if pairs else [])
+        run.settings(flatten(config), [f"accuracy/{name}" for name in WATCHED] if pairs and watch.paths else [])
+
+
+def fit_own(model: JointScanCRF, pairs: Sequence[ScanPair], config: Config) -> JointScanCRF:
+    """The model of `config.init` fitted to the pairs: what is kept is what helps on those left out in turn."""
+    load_weights(model, config.init)
+    fitted, parts = calibrate_on(model, pairs, config.staged)
+    for part in parts:
+        told = "kept" if part.is_kept else "not kept, as pairs left out do not gain"
+        log.info("%s (%s): %.0f %s left out, then %.0f: %s", part.name, part.value, part.before, part.measure, part.after, told)
+    return fitted
 
 
 def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], list[ScanPair]]:
@@ -289,7 +304,7 @@ def pairs_to_draw(pairs: Sequence[ScanPair], most: int = 4) -> list[int]:
 
 def write_results(folder: Path, scores: dict[str, list[PairScore]], tables: Sequence[Table]) -> None:
     """Writes `metrics.json`, `tables.md` and `versions.json`, each atomically."""
-    metrics = {method: summarise(of_method) for method, of_method in scores.items()}
+    metrics = {method: summarise(of_method) for method, of_method in scores.items() if of_method}
     contents = {
         "metrics.json": json.dumps(metrics, indent=2) + "\n",
         "tables.md": "\n\n".join(table.to_markdown() for table in tables) + "\n",

@@ -24,25 +24,35 @@ def flatten(designs: Sequence[Design]) -> Design:
     """All annotated nodes of many batches as one row of nodes: features (1, P, S, W), float64."""
     states = max(design.features.shape[2] for design in designs)
 
-    def rows(design: Design) -> tuple[Tensor, Tensor, Tensor]:
-        own = design.features.shape[2] - 1
+    def spread(values: Tensor) -> Tensor:
+        own = values.shape[1] - 1  # the outlier stays the last state
+        spare = values.new_zeros(len(values), states - 1 - own, *values.shape[2:])
+        return torch.cat([values[:, :own], spare, values[:, own:]], dim=1)
+
+    def rows(design: Design) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         features, mask, label = (part[design.known] for part in (design.features.detach().double(), design.mask, design.label))
-        spare = states - design.features.shape[2]  # the outlier stays the last state
-        features = torch.cat([features[:, :own], features.new_zeros(len(features), spare, features.shape[2]), features[:, own:]], 1)
-        mask = torch.cat([mask[:, :own], mask.new_zeros(len(mask), spare), mask[:, own:]], dim=1)
-        return features, mask, torch.where(label == own, states - 1, label)
+        extra = features.new_zeros(mask.shape) if design.extra is None else design.extra.detach().double()[design.known]
+        label = torch.where(label == design.features.shape[2] - 1, states - 1, label)
+        return spread(features), spread(mask), label, spread(extra)
 
     parts = [rows(design) for design in designs]
-    features, mask, label = (torch.cat([part[k] for part in parts])[None] for k in range(3))
-    return Design(features, mask, label, torch.ones_like(label, dtype=torch.bool))
+    features, mask, label, extra = (torch.cat([part[k] for part in parts])[None] for k in range(4))
+    return Design(features, mask, label, torch.ones_like(label, dtype=torch.bool), extra)
 
 
-def fit_chain(chains: Iterable[AnyChain], live: Tensor, config: LearningConfig, watch: Watch | None = None) -> Tensor:
+def fit_chain(
+    chains: Iterable[AnyChain | Design],
+    live: Tensor,
+    config: LearningConfig,
+    watch: Watch | None = None,
+    around: Tensor | None = None,
+) -> Tensor:
     """The weights of a chain or the lattice by `config.objective`: pseudo-likelihood, or exact likelihood started at its optimum.
 
     Args:
         chains: batches; pseudo-likelihood processes one at a time and keeps no transitions, of which dense chains have many.
-        live: (W,) 1 for the weights that are learned, 0 for those fixed at 0.
+        live: (W,) 1 for the weights that are learned, 0 for those that stay.
+        around: (W,) mean of the prior, where those stay; None: 0.
 
     Returns:
         (W,) float64.
@@ -58,11 +68,12 @@ def fit_chain(chains: Iterable[AnyChain], live: Tensor, config: LearningConfig, 
         if watch is not None:
             watch(done, loss, slope, weights)
 
-    weights = fit_weights(design, config, look, live=live)
+    weights = fit_weights(design, config, look, live=live, around=around)
     if not is_exact:
         return weights
-    exact = stack(list(chains))
-    return fit_weights(design, config, look, live=live, start=weights, log_likelihood=lambda w: exact.log_likelihood(w).sum())
+    exact = stack([chain for chain in chains if not isinstance(chain, Design)])
+    measure = lambda w: exact.log_likelihood(w).sum()  # noqa: E731
+    return fit_weights(design, config, look, live=live, start=weights, log_likelihood=measure, around=around)
 
 
 def stack(chains: Sequence[AnyChain]) -> AnyChain:
@@ -71,9 +82,11 @@ def stack(chains: Sequence[AnyChain]) -> AnyChain:
     lengths: dict[str, int] = {}
     for chain in chains:
         for name, axes in first.axes.items():
-            for axis, length in zip(axes, getattr(chain, name).shape[1:], strict=False):
+            for axis, length in zip(axes, () if getattr(chain, name) is None else getattr(chain, name).shape[1:], strict=False):
                 lengths[axis] = max(lengths.get(axis, 0), length)
     own = {name: next(of for of, axes in first.axes.items() if axis in axes) for name, axis in first.labels.items()}
+
+    held = [name for name in first.axes if getattr(first, name) is not None]
 
     def spread(chain: AnyChain, name: str) -> Tensor:
         values = getattr(chain, name).detach()
@@ -86,7 +99,7 @@ def stack(chains: Sequence[AnyChain]) -> AnyChain:
             values = _lengthen(values, dim, lengths[axis], is_states=axis not in "ne")
         return values
 
-    return replace(first, **{name: torch.cat([spread(chain, name) for chain in chains]) for name in first.axes})
+    return replace(first, **{name: torch.cat([spread(chain, name) for chain in chains]) for name in held})
 
 
 def _lengthen(values: Tensor, dim: int, length: int, *, is_states: bool) -> Tensor:
@@ -106,15 +119,17 @@ def fit_weights(
     live: Tensor | None = None,
     start: Tensor | None = None,
     log_likelihood: Callable[[Tensor], Tensor] | None = None,
+    around: Tensor | None = None,
 ) -> Tensor:
-    """Minimises -log likelihood + w^T w / (2 s_w^2) by L-BFGS, w in units of the features' spread; convex, so one optimum.
+    """Minimises -log likelihood + |w - w_0|^2 / (2 s_w^2) by L-BFGS, w in units of the features' spread; convex, so one optimum.
 
     Args:
         design: one row of nodes, see `flatten`; its log pseudo-likelihood is the default objective.
         watch: called with (step, objective per node, largest gradient entry per node, weights) after every step.
-        live: (W,) 1 for the weights that are learned, 0 for those fixed at 0; None: all.
-        start: (W,) initial weights; None: 0.
+        live: (W,) 1 for the weights that are learned, 0 for those that stay at w_0; None: all.
+        start: (W,) initial weights; None: w_0.
         log_likelihood: (W,) -> (), another objective on the same features.
+        around: (W,) mean w_0 of the prior; None: 0.
 
     Returns:
         (W,) float64 weights for unscaled features.
@@ -123,6 +138,7 @@ def fit_weights(
     per_unit = 1 / torch.where(spread > 1e-9, spread, torch.ones_like(spread))
     if live is not None:
         per_unit = per_unit * live
+    base = torch.zeros_like(per_unit) if around is None else around.detach().to(per_unit)
     nodes = max(1, int(design.known.sum()))
     measure = log_likelihood or (lambda weights: design.log_likelihood(weights).sum())
     step = 0
@@ -130,7 +146,7 @@ def fit_weights(
 
     def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
         scaled = torch.from_numpy(values).requires_grad_()
-        loss = ((scaled**2).sum() / (2 * config.prior**2) - measure(scaled * per_unit)) / nodes
+        loss = ((scaled**2).sum() / (2 * config.prior**2) - measure(base + scaled * per_unit)) / nodes
         (slope,) = torch.autograd.grad(loss, scaled)
         latest.update(loss=loss.item(), slope=float(slope.abs().max()))
         return latest["loss"], slope.numpy()
@@ -139,10 +155,11 @@ def fit_weights(
         nonlocal step
         step += 1
         if watch is not None:
-            watch(step, latest["loss"], latest["slope"], torch.from_numpy(intermediate_result.x) * per_unit)
+            watch(step, latest["loss"], latest["slope"], base + torch.from_numpy(intermediate_result.x) * per_unit)
 
-    first = torch.zeros_like(per_unit) if start is None else torch.where(per_unit > 0, start / per_unit.clamp(min=1e-12), 0.0)
+    first = base if start is None else start
+    first = torch.where(per_unit > 0, (first - base) / per_unit.clamp(min=1e-12), 0.0)
     idle = 0.0 if log_likelihood is None else 0.1 * config.tolerance  # least relative gain of a step: exact steps are expensive
     options = {"maxiter": config.max_steps, "gtol": config.tolerance, "ftol": idle, "maxcor": 10}
     found = minimize(objective, first.numpy(), jac=True, method="L-BFGS-B", callback=look, options=options)
-    return torch.from_numpy(found.x) * per_unit
+    return base + torch.from_numpy(found.x) * per_unit
