@@ -158,6 +158,48 @@ def test_lasso_assign_drag_undo_kill_and_reopen(browser: Any, serve: Serve, tmp_
     assert np.array_equal(saved(output, name).body, first.body)
 
 
+def test_the_keys_alone_and_a_click(browser: Any, serve: Serve, tmp_path: Path) -> None:
+    window = Window(browser, serve(tmp_path)[1])
+    (name,) = shown(browser)
+    width = np.ptp(window.points()[0][0])
+    window.press("+")
+    until(lambda: np.ptp(window.points()[0][0]) > 1.1 * width)
+    x, _ = window.points()[0]
+    for key in "p\ue014l":  # mode pan, arrow right
+        window.press(key)
+    until(lambda: (window.points()[0][0] < x - 10).all())
+    window.press("h")
+    until(lambda: np.ptp(window.points()[0][0]) == pytest.approx(width, rel=0.01))
+
+    window.press(".")  # the first point
+    window.press("u")
+    until((tmp_path / f"{name}.npz").exists)
+    pair = read_pair(tmp_path / f"{name}.npz")
+    assert saved(tmp_path, name).ignore[pair.source.beam[0]]
+    assert not saved(tmp_path, name).ignore[pair.source.beam[1:]].any()
+
+    association = saved(tmp_path, name).association[pair.source.beam]
+    where = np.flatnonzero(association >= 0)[0]
+    for _ in range(where + 1):
+        window.press(".")
+    window.press("x")  # no counterpart
+    until(lambda: saved(tmp_path, name).association[pair.source.beam[where]] == -1)
+    assert saved(tmp_path, name).body[pair.source.beam[where]] >= 0
+
+    x, y = window.points()[0]
+    alone = int(np.argmax([np.sort(np.hypot(x - a, y - b))[1] for a, b in zip(x, y, strict=True)]))
+    window.drag([(x[alone], y[alone]), (x[alone], y[alone])])
+    window.press("n")
+    until(lambda: saved(tmp_path, name).body[pair.source.beam[alone]] > 0)
+
+    before = saved(tmp_path, name)
+    window.press("\ue00f")  # page down
+    until(lambda: shown(browser) != [name])
+    window.press("\ue00e")  # page up
+    until(lambda: shown(browser) == [name])
+    assert np.array_equal(saved(tmp_path, name).body, before.body)
+
+
 def shown(browser: Any) -> list[str]:
     """The name of the pair on the page."""
     title = browser.execute_script("return Bokeh.documents[0].get_model_by_name('title').text")

@@ -178,9 +178,11 @@ def mend(document: Document, points: Ints, targets: Ints) -> Document:
 def surface(document: Document, points: Ints) -> Ints:
     """The points, and all that are connected with them beam by beam."""
     source = document.scans.source
-    footprint = np.linalg.norm(source, axis=-1) * np.median(np.diff(document.scans.pair.source.bearings, append=0.0))
-    is_gap = np.linalg.norm(np.diff(source, axis=0), axis=-1) > document.scans.gate + 3 * np.abs(footprint[1:])
-    run = np.append(0, np.cumsum(is_gap)) if len(source) else np.zeros(0, dtype=np.int64)
+    if not len(points):
+        return points
+    step = np.median(np.diff(document.scans.pair.source.bearings)) if len(source) > 1 else 0.0
+    is_gap = np.linalg.norm(np.diff(source, axis=0), axis=-1) > document.scans.gate + 3 * step * np.hypot(*source[1:].T)
+    run = np.append(0, np.cumsum(is_gap))
     return np.flatnonzero(np.isin(run, run[points]))
 
 

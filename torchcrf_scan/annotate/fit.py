@@ -16,6 +16,7 @@ from torchcrf_scan.scan import OUTLIER, Floats, Ints, ScanPair
 FOLLOWS = -2  # no target point given by hand: the nearest one within the gate counts
 GATE = 3.2  # times half the scan's usual spacing plus twice its noise, as in the simulator's annotation
 WIDE = (8.0, 8.0, 4.0, 4.0, 2.0, 2.0)  # gates of a search for a motion, one a round; then 1 until nothing changes
+STARTS = 4  # at most, of a search
 ROUNDS = 40  # at most
 ALONG = 0.1  # weight of distances along the target's surface, beside 1 across it
 SETTLED = 1e-9  # radians or metres
@@ -79,9 +80,12 @@ def fit(scans: Scans, points: Floats, given: Ints, start: Floats, is_line: bool,
 
 
 def search(scans: Scans, points: Floats, given: Ints, starts: Iterable[Floats], is_line: bool) -> Floats:
-    """(3,) the motion that fits best of those found from several starts, with gates that narrow down."""
-    found = [fit(scans, points, given, start, is_line, WIDE) for start in starts]
-    return min(found, key=lambda motion: scans.misfit(se2.apply(motion, points)))
+    """(3,) the motion that fits best of those found from the best starts, with gates that narrow down."""
+
+    def misfit(motion: Floats) -> float:
+        return scans.misfit(se2.apply(motion, points))
+
+    return min((fit(scans, points, given, start, is_line, WIDE) for start in sorted(starts, key=misfit)[:STARTS]), key=misfit)
 
 
 def _fitted(scans: Scans, points: Floats, association: Ints, motion: Floats, is_line: bool) -> Floats:
@@ -99,9 +103,9 @@ def _fitted(scans: Scans, points: Floats, association: Ints, motion: Floats, is_
 
 def _slid(motion: Floats, moved: Floats, there: Floats, tangent: Floats) -> Floats:
     """One point-to-line step; along the surface, where the points say little, they count `ALONG` times."""
-    has_line = tangent.any(-1)
+    has_line = np.hypot(*tangent.T) > 0
     tangent = np.where(has_line[:, None], tangent, (1.0, 0.0))
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
     weights = np.append(np.ones(len(moved)), np.where(has_line, ALONG, 1.0))
-    twice = (np.concatenate([values, values])[None] for values in (moved, there))
-    return slide(motion[None], *twice, np.concatenate([tangent, normal])[None], weights[None])[0]
+    moved, there = (np.concatenate([values, values]) for values in (moved, there))
+    return slide(motion[None], moved[None], there[None], np.concatenate([tangent, normal])[None], weights[None])[0]

@@ -11,7 +11,10 @@ import numpy as np
 from bokeh.document import Document as BokehDocument
 from bokeh.events import ConnectionLost, DocumentReady, Pan, PanEnd, PanStart
 from bokeh.layouts import column, row
-from bokeh.models import Button, CustomJS, Div, RadioButtonGroup
+from bokeh.models import CustomJS
+from bokeh.models.widgets.buttons import Button
+from bokeh.models.widgets.groups import RadioButtonGroup
+from bokeh.models.widgets.markups import Div
 
 from torchcrf_scan.annotate import document as edit
 from torchcrf_scan.annotate.desk import Desk
@@ -24,6 +27,7 @@ from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints
 from torchcrf_scan.viz.marks import NOTE, WRONG
 
 MODES = ("select", "move", "pan")
+MODE_KEYS = {"l": 0, "m": 1, "p": 2}
 WIDTH = 390  # pixels of what stands beside the picture
 NUDGE, TURN, FAST = 0.01, math.radians(0.1), 10.0  # metres, radians; with Shift so many times more
 AGAIN = 5000  # milliseconds after which what could not be saved is tried once more
@@ -38,6 +42,9 @@ document.addEventListener("keydown", (event) => {
   const key = (event.ctrlKey ? "ctrl+" : "") + event.key
   if (!known.includes(key)) return
   event.preventDefault()
+  if (key in modes) return group.active = modes[key]
+  const look = zooms[key] ?? (group.active == 2 ? pans[key] : undefined)
+  if (look !== undefined) return look.do.emit()
   box.tags = [key, event.shiftKey, (box.tags[2] ?? 0) + 1]
 })
 """
@@ -87,7 +94,15 @@ class Page:
             plot.on_event(event, answer)
         self.box.on_change("tags", lambda _attribute, _old, new: self.press(new[0], bool(new[1])))
         self.mode.js_on_change("active", CustomJS(args={"group": self.mode, "lasso": picture.lasso, "pan": picture.pan}, code=MODE))
-        self.doc.js_on_event(DocumentReady, CustomJS(args={"box": self.box, "known": list(ACTIONS)}, code=PRESS))
+        press = {
+            "modes": MODE_KEYS,
+            "box": self.box,
+            "group": self.mode,
+            "zooms": picture.zooms,
+            "pans": picture.pans,
+            "known": list(ACTIONS),
+        }
+        self.doc.js_on_event(DocumentReady, CustomJS(args=press, code=PRESS))
         self.doc.js_on_event(ConnectionLost, CustomJS(args={"error": self.error}, code=LOST))
         self.doc.add_periodic_callback(self._retry, AGAIN)
 
@@ -163,14 +178,8 @@ class Page:
         n = len(self.desk.document.label)
         return np.array(sorted(i for i in self.picture.source.selected.indices if 0 <= i < n), dtype=np.int64)
 
-    def _mode_select(self, key: str, is_fast: bool) -> None:
-        self.mode.active = 0
-
-    def _mode_move(self, key: str, is_fast: bool) -> None:
-        self.mode.active = 1
-
-    def _mode_pan(self, key: str, is_fast: bool) -> None:
-        self.mode.active = 2
+    def _browser(self, key: str, is_fast: bool) -> None:
+        """Modes and zoom: the browser has changed them itself."""
 
     def _step(self, key: str, is_fast: bool) -> None:
         step, n, chosen = (1 if key == "." else -1), len(self.desk.document.label), self.chosen
@@ -190,9 +199,6 @@ class Page:
         bodies = [BACKGROUND, *self.desk.document.movers]
         self.active = bodies[(bodies.index(self.active) + 1) % len(bodies)]
 
-    def _zoom(self, key: str, is_fast: bool) -> None:
-        self.picture.zoom(1.25 if key == "-" else 0.8)
-
     def _whole(self, key: str, is_fast: bool) -> None:
         chosen = self.chosen
         self.picture.open(self.desk.document)
@@ -201,7 +207,8 @@ class Page:
     def _closer(self, key: str, is_fast: bool) -> None:
         points = self.desk.document.moved[self.desk.document.of(self.active)]
         if len(points) and np.isfinite(points).all():
-            self.picture.zoom_to(np.array([points.min(axis=0) - 1, points.max(axis=0) + 1]))
+            margin = 0.2 + 0.5 * np.ptp(points, axis=0).max()
+            self.picture.zoom_to(np.array([points.min(axis=0) - margin, points.max(axis=0) + margin]))
 
     def _view(self, key: str, is_fast: bool) -> None:
         self.is_own = not self.is_own
@@ -210,6 +217,7 @@ class Page:
 
     def _give(self, label: int) -> None:
         self.desk.change(edit.assign(self.desk.document, self.chosen, label))
+        self.picture.choose(np.zeros(0, np.int64))
 
     def _digit(self, key: str, is_fast: bool) -> None:
         if len(self.chosen):
@@ -264,11 +272,8 @@ class Page:
 
     def _arrow(self, key: str, is_fast: bool) -> None:
         x, y = ARROWS[key]
-        if self.mode.active == MODES.index("pan"):
-            self.picture.zoom(1.0, (0.1 * x, 0.1 * y))
-        else:
-            step = NUDGE * (FAST if is_fast else 1.0)
-            self.desk.change(edit.drag(self.desk.document, self.active, np.array([0.0, step * x, step * y])))
+        step = NUDGE * (FAST if is_fast else 1.0)
+        self.desk.change(edit.drag(self.desk.document, self.active, np.array([0.0, step * x, step * y])))
 
     def _turn(self, key: str, is_fast: bool) -> None:
         step = TURN * (FAST if key in "{}" else 1.0) * (1 if key in "[{" else -1)

@@ -5,7 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, CustomJS, DataRange1d, LassoSelectTool, PanTool, Scatter, TapTool, WheelZoomTool
+from bokeh.models import (
+    ClickPanTool,
+    ColumnDataSource,
+    CustomJS,
+    DataRange1d,
+    LassoSelectTool,
+    PanTool,
+    Scatter,
+    TapTool,
+    WheelZoomTool,
+    ZoomInTool,
+    ZoomOutTool,
+)
 from bokeh.plotting import figure
 
 from torchcrf_scan.annotate.document import UNKNOWN, Document
@@ -31,7 +43,8 @@ class Picture:
     """A figure and the points in it, which the browser selects.
 
     Attributes:
-        figure: of bokeh. lasso, pan: its tools. source, target: tables of points, with what is selected in them.
+        figure: of bokeh. lasso, pan: its tools. zooms, pans: those that keys stand for.
+        source, target: tables of points, with what is selected in them.
     """
 
     def __init__(self) -> None:
@@ -39,15 +52,16 @@ class Picture:
         names |= {"doubts": "x y", "names": "x y text color"}
         tables = {name: ColumnDataSource({key: [] for key in keys.split()}, name=name) for name, keys in names.items()}
         self._frame, self.target, self._links, self.source, self._doubts, self._names = tables.values()
+        spans = DataRange1d(range_padding=0.03), DataRange1d(range_padding=0.03)
         self.figure = plot = figure(
             name="scans", tools=[], toolbar_location=None, match_aspect=True, sizing_mode="stretch_both", min_border=8,
-            x_range=DataRange1d(range_padding=0.03), y_range=DataRange1d(range_padding=0.03),
-            x_axis_label="ahead, m", y_axis_label="left, m",
+            x_range=spans[0], y_range=spans[1], x_axis_label="ahead, m", y_axis_label="left, m",
         )  # fmt: skip
         plot.grid.grid_line_color = "#EEF0F2"
         plot.outline_line_color = STATIC
         frame = plot.scatter("x", "y", source=self._frame, size=0.1, alpha=0.0)
-        plot.x_range.renderers = plot.y_range.renderers = [frame]
+        for span in spans:
+            span.renderers = [frame]
         rings = plot.scatter("x", "y", source=self.target, size=10, fill_color=None, line_color=NOTE, line_width=1.2)
         plot.segment("x0", "y0", "x1", "y1", source=self._links, color="color", line_width=2.5)
         plot.scatter("x", "y", source=self._doubts, size=17, fill_color=None, line_color=WRONG, line_dash="dotted", line_width=1.5)
@@ -55,7 +69,7 @@ class Picture:
             "x", "y", source=self.source, size=8, marker="marker", fill_color="color", line_color="line", line_width=1.5
         )
         plot.scatter([0], [0], marker="triangle", angle=-np.pi / 2, size=15, fill_color=INK, line_color="white")
-        plot.text("x", "y", text="text", source=self._names, text_color="color", text_font_style="bold", x_offset=10, y_offset=-8)
+        plot.text("x", "y", text="text", source=self._names, text_color="color", text_font_style="bold", x_offset=12, y_offset=-12)
         for renderer in (rings, dots):  # the rest keeps its colours
             renderer.nonselection_glyph = renderer.glyph
             chosen = {name: getattr(renderer.glyph, name) for name in ("x", "y", "marker", "fill_color")}
@@ -63,6 +77,11 @@ class Picture:
         self.lasso, self.pan, wheel = LassoSelectTool(renderers=[dots]), PanTool(), WheelZoomTool()
         plot.add_tools(self.lasso, self.pan, wheel, TapTool(renderers=[dots, rings]))
         plot.toolbar.active_scroll, plot.toolbar.active_drag = wheel, self.lasso
+        larger, smaller = ZoomInTool(factor=0.2), ZoomOutTool(factor=0.2)
+        self.zooms = {"+": larger, "=": larger, "-": smaller}
+        ways = {"ArrowLeft": "left", "ArrowRight": "right", "ArrowUp": "up", "ArrowDown": "down"}
+        self.pans = {key: ClickPanTool(direction=way) for key, way in ways.items()}
+        plot.add_tools(larger, smaller, *self.pans.values())
         self._frame.js_on_change("data", CustomJS(args={"plot": plot}, code="setTimeout(() => plot.reset.emit())"))
 
     def open(self, document: Document) -> None:
@@ -76,13 +95,6 @@ class Picture:
     def zoom_to(self, corners: Floats) -> None:
         """A window around points (P, 2)."""
         self._frame.data = {"x": corners[:, 0], "y": corners[:, 1]}
-
-    def zoom(self, factor: float, shift: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Makes the window so much larger, and shifts it by shares of its size."""
-        for span, share in ((self.figure.x_range, shift[0]), (self.figure.y_range, shift[1])):
-            size = span.end - span.start
-            middle = (span.start + span.end) / 2 + share * size
-            span.update(start=middle - factor * size / 2, end=middle + factor * size / 2)
 
     def choose(self, points: Ints) -> None:
         """Selects points of the source, and no ring."""
