@@ -79,7 +79,7 @@ class Picture:
         plot.toolbar.active_scroll, plot.toolbar.active_drag = wheel, self.lasso
         larger, smaller = ZoomInTool(factor=0.2), ZoomOutTool(factor=0.2)
         self.zooms = {"+": larger, "=": larger, "-": smaller}
-        ways = {"ArrowLeft": "left", "ArrowRight": "right", "ArrowUp": "up", "ArrowDown": "down"}
+        ways: dict[str, Any] = {"ArrowLeft": "left", "ArrowRight": "right", "ArrowUp": "up", "ArrowDown": "down"}
         self.pans = {key: ClickPanTool(direction=way) for key, way in ways.items()}
         plot.add_tools(larger, smaller, *self.pans.values())
         self._frame.js_on_change("data", CustomJS(args={"plot": plot}, code="setTimeout(() => plot.reset.emit())"))
