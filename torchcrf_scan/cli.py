@@ -15,6 +15,7 @@ from typing import Any
 from jsonargparse import ActionYesNo
 
 from torchcrf_scan import __version__
+from torchcrf_scan.commands.annotate import annotate
 from torchcrf_scan.commands.bench import bench
 from torchcrf_scan.commands.calibrate import calibrate
 from torchcrf_scan.commands.drives import drives
@@ -44,6 +45,7 @@ COMMANDS: Mapping[str, Callable[..., int]] = {
     "calibrate": calibrate,
     "experiment": experiment,
     "plot": plot,
+    "annotate": annotate,
     "listen": listen,
     "bench": bench,
     "drives": drives,
@@ -64,6 +66,7 @@ FLAGS: Mapping[str, str] = {  # parameter that is true or false: help
     "rounds": "also tell the joint objective after every step of the rounds, and whether they converge (method joint)",
     "use_odometry": "take the log's odometry as the first guess of the sensor's motion",
     "clean": "also write the log again without the beams that hit moving objects, and a bag with the odometry found",
+    "open": "also open the page in the browser",
     "visualize": "show everything in the viewer of rerun while it is computed (extra `viewer`)",
 }
 

@@ -87,15 +87,23 @@ def line_step(motions: Floats, points: Floats, target: Cloud, gate: float) -> Fl
     """The same with distances across the surface only (point to line), by one damped Gauss-Newton step."""
     moved = se2.apply(motions, points)  # (H, P, 2)
     distance, index = target.nearest(moved)
-    tangent = target.tangent[index]
+    return slide(motions, moved, target.points[index], target.tangent[index], _kept(distance, gate))
+
+
+def slide(motions: Floats, moved: Floats, target: Floats, tangent: Floats, weights: Floats) -> Floats:
+    """One damped Gauss-Newton step of point-to-line distances.
+
+    Args:
+        motions: (H, 3). moved: (H, P, 2) the points under them.
+        target, tangent: (H, P, 2) their counterparts and the surface's directions there. weights: (H, P).
+    """
     normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
-    weights = _kept(distance, gate)
     total = np.maximum(weights.sum(-1), 1.0)[:, None]
     centre = (weights[..., None] * moved).sum(1) / total  # (H, 2)
     arm = moved - centre[:, None]
     turning = arm[..., 0] * normal[..., 1] - arm[..., 1] * normal[..., 0]
     jacobian = np.concatenate([turning[..., None], normal], axis=-1)  # (H, P, 3)
-    residual = ((moved - target.points[index]) * normal).sum(-1)
+    residual = ((moved - target) * normal).sum(-1)
     weighted = weights[..., None] * jacobian
     spread = (weights * (arm**2).sum(-1)).sum(-1)[:, None]
     damping = 1e-3 * np.concatenate([spread, total, total], axis=-1) + 1e-12

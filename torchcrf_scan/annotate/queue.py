@@ -1,0 +1,28 @@
+"""The order in which pairs are annotated: those the model is least sure of first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from torchcrf_scan.scan import PairPrediction, ScanPair
+
+
+def confidence_of(pair: ScanPair, prediction: PairPrediction | None) -> float:
+    """Mean confidence, in [0, 1], of the points' associations and clusters; 1 for a pair without points, 0 without an answer."""
+    if prediction is None:
+        return 0.0
+    both = np.minimum(prediction.association_confidence, prediction.cluster_confidence)[pair.source.beam]
+    return float(both.mean()) if len(both) else 1.0
+
+
+def order(confidences: Mapping[str, float], done: Sequence[str]) -> list[str]:
+    """The names of pairs not done, by rising confidence, then those done, the last one last: a ring."""
+    left = sorted((name for name in confidences if name not in done), key=lambda name: (confidences[name], name))
+    return [*left, *(name for name in done if name in confidences)]
+
+
+def neighbour(ring: Sequence[str], name: str, step: int) -> str:
+    """The name so many places after another in a ring."""
+    return ring[(ring.index(name) + step) % len(ring)]
