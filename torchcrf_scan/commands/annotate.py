@@ -76,7 +76,7 @@ def annotate(
         raise ValueError(f"files: expected pairs to annotate, got none{left_out}")
     server, port = make_server(Desk(cases, store, outlier_distance), port)
     address = f"http://{ADDRESS}:{port}/"
-    print(f"{len(cases)} pairs at {address}, annotations in {output}; Ctrl-C ends{left_out}", flush=True)
+    print(f"{len(cases)} pairs, annotations in {output}, Ctrl-C ends{left_out}: {address}", flush=True)
     if open:
         import webbrowser
 
