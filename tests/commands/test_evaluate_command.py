@@ -123,7 +123,7 @@ def test_tables_have_a_row_for_every_sequence_and_for_all(
 def test_one_sequence_needs_one_row(pairs_dir: Path, predictions_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("evaluate", f"{pairs_dir}/sim_s0_*.npz", "--predictions", predictions_dir) == 0
     out = capsys.readouterr().out
-    assert out.count("| predictions, all |") == 7
+    assert out.count("| predictions, all |") == 10
     assert "sim3_0" not in out
 
 

@@ -67,9 +67,11 @@ def test_the_run_folder_has_a_checkpoint_and_the_training_events(run: Path) -> N
     events.Reload()
     assert [event.step for event in events.Scalars("loss/total")] == [1, 2]
     assert [event.step for event in events.Scalars("validation/total")] == [0, 1, 2]
-    metrics = json.loads((run / "metrics.json").read_text())
-    final = events.Scalars("final/cluster_accuracy")[0].value
-    assert final == pytest.approx(metrics["joint"]["cluster_accuracy"], rel=1e-5)
+    staged = EventAccumulator(str(run / "events"), size_guidance={"tensors": 0})
+    staged.Reload()
+    (final,) = staged.Tensors("final/text_summary")  # the numbers of the test pairs, of which no curve is drawn
+    assert final.tensor_proto.string_val[0].decode().strip() == (run / "tables.md").read_text().strip()
+    assert not any(tag.startswith("final/") for tag in events.Tags()["scalars"])
 
 
 def test_the_saved_model_is_the_best_of_the_looks(run: Path) -> None:
@@ -171,8 +173,7 @@ def test_augmentation_out_of_range_is_named(name: str) -> None:
 def test_objectives_that_do_not_go_together_are_named() -> None:
     with pytest.raises(ValueError, match=r"gradient\.objective: expected unrolled"):
         Config(learning=LearningConfig(objective="unrolled"), gradient=GradientConfig(objective="pseudo_likelihood"))
-    with pytest.raises(ValueError, match=r"init: expected a gradient\.objective"):
-        Config(init="simulated")
+    assert not Config(init="simulated").has_steps  # fitted to the pairs as it is, see `learning.own_laser`
     assert Config().first_order == "none"
     both = Config(learning=LearningConfig(objective="unrolled"))
     assert (both.first_order, both.staged.objective) == ("unrolled", "pseudo_likelihood")

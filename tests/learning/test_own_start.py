@@ -26,6 +26,7 @@ from torchcrf_scan.learning.own_start import own_starts, start_anew
 from torchcrf_scan.learning.portions import as_portion
 from torchcrf_scan.learning.run_log import RunLog
 from torchcrf_scan.learning.settings import Config, LearningConfig
+from torchcrf_scan.learning.staged_watch import StagedWatch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.search.score import HypothesisScore
 
@@ -133,7 +134,8 @@ def test_an_experiments_and_a_runs_models_are_trained_there(tmp_path: Path, monk
     monkeypatch.setattr(trainer, "own_starts", watch)
     monkeypatch.setattr(trainer, "fit", fit_on)
     with RunLog(tmp_path) as run:
-        trainer.prepare(JointScanCRF(config.model), pairs, Config(model=config.model, learning=config.learning), run, None)
+        watched = StagedWatch(run)
+        trainer.prepare(JointScanCRF(config.model), pairs, Config(model=config.model, learning=config.learning), watched, None)
     assert len(trained) == 2
 
 
