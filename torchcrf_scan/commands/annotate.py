@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import webbrowser
 from typing import TYPE_CHECKING
 
 from tqdm import tqdm
@@ -60,10 +61,7 @@ def annotate(
         from torchcrf_scan.annotate.server import ADDRESS, make_server, serve
     except ImportError as error:
         raise ValueError(f"annotate: expected bokeh (pip install torchcrf-scan[annotate]), got {error}") from error
-    if not 0 <= port < 1 << 16:
-        raise ValueError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
-    if outlier_distance is not None and not 0 < outlier_distance < float("inf"):
-        raise ValueError(f"--outlier_distance: expected metres above 0, got {outlier_distance}")
+    _check_numbers(port, outlier_distance)
     failures: list[str] = []
     left_out = LeftOut()
     places = find_pairs(files, every, failures, ReadOptions(topic, odometry, no_return, left_out.add))
@@ -78,11 +76,17 @@ def annotate(
     address = f"http://{ADDRESS}:{port}/"
     print(f"{len(cases)} pairs, annotations in {output}, Ctrl-C ends{left_out}: {address}", flush=True)
     if open:
-        import webbrowser
-
         webbrowser.open(address)
     serve(server)
     return 0
+
+
+def _check_numbers(port: int, outlier_distance: float | None) -> None:
+    """Raises ValueError for a port or a distance that cannot be."""
+    if not 0 <= port < 1 << 16:
+        raise ValueError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
+    if outlier_distance is not None and not 0 < outlier_distance < float("inf"):
+        raise ValueError(f"--outlier_distance: expected metres above 0, got {outlier_distance}")
 
 
 def _check_apart(places: list[PairPlace], store: Store) -> None:

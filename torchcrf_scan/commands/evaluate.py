@@ -108,12 +108,9 @@ def evaluate(
     else:
         answers = _run(name, load, list(pairs.values()), displacement, seed)
     tables, figures = _score(name, list(pairs.values()), answers, displacement, seed)
-    if causes:
-        more, counts = explain(load(), list(pairs.values()), worst, output)
+    for look in ([partial(explain, worst=worst, output=output)] if causes else []) + ([tell_rounds] if rounds else []):
+        more, counts = look(load(), list(pairs.values()))
         tables, figures = tables + more, figures | counts
-    if rounds:
-        more, courses = tell_rounds(load(), list(pairs.values()))
-        tables, figures = tables + more, figures | courses
     _tell(tables, figures, json)
     return 0
 

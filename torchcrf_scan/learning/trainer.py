@@ -107,8 +107,7 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
                 train_by_gradient(model, config, train_pairs, held_out, store, ranks, monitor, state=state)
         cascade = None
         if run is not None:
-            is_joint = model.config.has_association and model.config.has_clusters
-            if config.has_steps and config.gradient.refit_potential and is_joint:
+            if config.has_steps and config.gradient.refit_potential and model.config.has_association and model.config.has_clusters:
                 model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
             if is_fitted_before:
                 model = fit_own(model, train_pairs, config)
