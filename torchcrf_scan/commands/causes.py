@@ -41,11 +41,11 @@ def check(output: str | None, worst: int, causes: bool) -> None:
 
 def trace(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Traced:
     """The answers of a model with the traces of its search; raises ValueError for a model that cannot be traced."""
-    from torchcrf_scan.evaluation.metrics import score_pair
+    from torchcrf_scan.evaluation.metrics import score_pairs
 
     found = [both for part in batches(pairs) for both in model.trace_pairs(part)]
     answers, traces = [answer for answer, _ in found], [of for _, of in found]
-    return Traced(model, pairs, answers, traces, [score_pair(*of) for of in zip(pairs, answers, strict=True)])
+    return Traced(model, pairs, answers, traces, score_pairs(pairs, answers))
 
 
 def explain(model: JointScanCRF, pairs: Sequence[ScanPair], worst: int, output: str | None) -> tuple[list[Table], dict[str, Any]]:

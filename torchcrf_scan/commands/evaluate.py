@@ -108,11 +108,18 @@ def evaluate(
     else:
         answers = _run(name, load, list(pairs.values()), displacement, seed)
     tables, figures = _score(name, list(pairs.values()), answers, displacement, seed)
-    for look in ([partial(explain, worst=worst, output=output)] if causes else []) + ([tell_rounds] if rounds else []):
-        more, counts = look(load(), list(pairs.values()))
-        tables, figures = tables + more, figures | counts
-    _tell(tables, figures, json)
+    more, counts = _looks(load, list(pairs.values()), (causes, rounds), worst, output)
+    _tell(tables + more, figures | counts, json)
     return 0
+
+
+def _looks(
+    load: Loader, pairs: Sequence[ScanPair], asked: tuple[bool, bool], worst: int, output: str | None
+) -> tuple[list[Table], dict[str, Any]]:
+    """Tables and entries of `--json` of `--causes` and of `--rounds`, if asked for."""
+    tables, figures = explain(load(), pairs, worst, output) if asked[0] else ([], {})
+    more, courses = tell_rounds(load(), pairs) if asked[1] else ([], {})
+    return tables + more, figures | courses
 
 
 def _tell(tables: Sequence[Table], figures: dict[str, Any], path: str | None) -> None:
@@ -126,11 +133,11 @@ def _score(
     name: str, pairs: Sequence[ScanPair], answers: Sequence[PairPrediction], displacement: FrameOffset | None, seed: int
 ) -> tuple[list[Table], dict[str, Any]]:
     """All tables and the entries of `--json`."""
-    from torchcrf_scan.evaluation.metrics import score_pair
+    from torchcrf_scan.evaluation.metrics import score_pairs
     from torchcrf_scan.evaluation.neighbours import NeighbourScore, neighbour_tables
     from torchcrf_scan.evaluation.report import report
 
-    scores = [score_pair(pair, answer) for pair, answer in zip(pairs, answers, strict=True)]
+    scores = score_pairs(pairs, answers)
     beside = [NeighbourScore.of(pair, answer) for pair, answer in zip(pairs, answers, strict=True)]
     tables, figures = [*report(rows_of(name, scores)), *neighbour_tables(rows_of(name, beside))], _figures(name, scores, beside)
     if displacement is not None:

@@ -6,6 +6,7 @@ ones by maximum overlap, background and outlier are fixed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -130,6 +131,11 @@ class PairScore:
     def has_ego_within(self, translation: float, rotation: float) -> bool:
         """Whether the error of the ego motion is within these bounds, metres and radians; False when unknown."""
         return self.ego_translation < translation and self.ego_rotation < rotation
+
+
+def score_pairs(pairs: Sequence[ScanPair], predictions: Sequence[PairPrediction]) -> list[PairScore]:
+    """Scores the predictions of annotated pairs; raises ValueError as `score_pair`, or for another number of them."""
+    return [score_pair(pair, prediction) for pair, prediction in zip(pairs, predictions, strict=True)]
 
 
 def score_pair(pair: ScanPair, prediction: PairPrediction) -> PairScore:

@@ -17,7 +17,7 @@ from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import NAMED_WORLDS
 from torchcrf_scan.evaluation.bootstrap import by_blocks, by_sequence
-from torchcrf_scan.evaluation.metrics import PairScore, score_pair
+from torchcrf_scan.evaluation.metrics import PairScore, score_pairs
 from torchcrf_scan.evaluation.report import Scores, differences_table, report, sequences_table
 from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.experiment.ablation import ablation_table
@@ -219,10 +219,7 @@ def find_pairs(wanted: Sequence[str], pairs: Sequence[ScanPair]) -> list[ScanPai
 
 def score(results: Results) -> dict[str, list[PairScore]]:
     """Every method's scores, in the order of the pairs."""
-    return {
-        method: [score_pair(pair, one) for pair, one in zip(results.pairs, predictions, strict=True)]
-        for method, predictions in results.predictions.items()
-    }
+    return {method: score_pairs(results.pairs, predictions) for method, predictions in results.predictions.items()}
 
 
 def resample(scores: Sequence[PairScore], config: RunConfig) -> Ints:

@@ -18,7 +18,7 @@ from torch.utils.tensorboard import SummaryWriter
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.choices import SCHEDULES
 from torchcrf_scan.evaluation.calibration import Sureness
-from torchcrf_scan.evaluation.metrics import score_pair
+from torchcrf_scan.evaluation.metrics import score_pairs
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.inference import pseudo_likelihood
 from torchcrf_scan.inference.start import Start
@@ -115,7 +115,7 @@ class TrainingMonitor:
         """Losses, metrics beside those of the baselines, histograms and pictures of one validation."""
         self._scalars({f"validation/{name}": value for name, value in losses.items()}, step)
         for method, predictions in answers.predictions.items():
-            found = summarise([score_pair(pair, answer) for pair, answer in zip(answers.pairs, predictions, strict=True)])
+            found = summarise(score_pairs(answers.pairs, predictions))
             names = [(group, name) for group, of_group in GROUPS.items() for name in of_group]
             self._scalars({f"{group}/{name}/{method}": found[name] for group, name in names}, step)
         self._figures(step, answers)

@@ -253,6 +253,11 @@ class Config:
         return self.first_order != NO_STEPS
 
     @property
+    def fits_init(self) -> bool:
+        """Whether the model of `init` is fitted to the training pairs as it is, without first-order training."""
+        return bool(self.init) and not self.has_steps
+
+    @property
     def staged(self) -> LearningConfig:
         """Settings of the staged fit; a loss that it does not support is replaced by `STAGED`."""
         return self.learning if LOSSES[self.learning.objective].is_staged else replace(self.learning, objective=STAGED)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchcrf_scan.baselines.start import label_nearest
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.evaluation.metrics import PairScore, score_pair
+from torchcrf_scan.evaluation.metrics import score_pairs
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.learning.fit import set_weights
 from torchcrf_scan.learning.run_log import RunLog
@@ -22,7 +22,7 @@ from torchcrf_scan.learning.validation import BASELINE
 from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
-from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.scan import ScanPair
 from torchcrf_scan.variants.register import ONE_CHAINS
 
 LOOKS = (1, 4, 16)  # steps that are looked at, and the last one
@@ -64,10 +64,10 @@ class StagedWatch:
         start = model.initialise(batch)
         rival = label_nearest(batch, start)
         for step in (0, self.last):
-            self.run.curves(summarise(scores_of(some, [rival.pair(b, pair) for b, pair in enumerate(some)])), step, BASELINE)
+            self.run.curves(summarise(score_pairs(some, [rival.pair(b, pair) for b, pair in enumerate(some)])), step, BASELINE)
         for step in sorted({*(look for look in LOOKS if look < self.last), self.last}):
             found = self.at(step, model)(batch, start)
-            self.run.curves(summarise(scores_of(some, [found.pair(b, pair) for b, pair in enumerate(some)])), step)
+            self.run.curves(summarise(score_pairs(some, [found.pair(b, pair) for b, pair in enumerate(some)])), step)
 
     def at(self, step: int, model: JointScanCRF) -> JointScanCRF:
         """The model with the weights of a step of both chains; those of the last one for a chain that was done before."""
@@ -81,8 +81,3 @@ class StagedWatch:
             else:
                 set_weights(other, chain, weights)
         return other
-
-
-def scores_of(pairs: Sequence[ScanPair], answers: Sequence[PairPrediction]) -> list[PairScore]:
-    """The scores of answers."""
-    return [score_pair(pair, answer) for pair, answer in zip(pairs, answers, strict=True)]

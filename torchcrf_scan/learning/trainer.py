@@ -25,7 +25,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.dataset import PairFiles, split_by_sequence
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import NAMED_WORLDS
-from torchcrf_scan.evaluation.metrics import PairScore, score_pair
+from torchcrf_scan.evaluation.metrics import PairScore, score_pairs
 from torchcrf_scan.evaluation.report import report
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.evaluation.table import Table
@@ -98,8 +98,7 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
     with RunLog(folder) if ranks.is_first else nullcontext() as run:
         model = JointScanCRF(config.model)
         watch = StagedWatch(run) if run is not None else None
-        is_fitted_before = bool(config.init) and not config.has_steps
-        material = prepare(model, train_pairs, config, watch, state) if watch is not None and not is_fitted_before else []
+        material = prepare(model, train_pairs, config, watch, state) if watch is not None and not config.fits_init else []
         if config.has_steps:
             ranks.share_weights(model)
             first_step = state["step"] + 1 if state else None
@@ -109,7 +108,7 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
         if run is not None:
             if config.has_steps and config.gradient.refit_potential and model.config.has_association and model.config.has_clusters:
                 model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
-            if is_fitted_before:
+            if config.fits_init:
                 model = fit_own(model, train_pairs, config)
             else:
                 calibrate(model, material)
@@ -117,6 +116,7 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
             model.save_pretrained(folder / "model")
             trained_on.write(folder / "model")
             log.info("fitted in %.0f s", time.perf_counter() - began)
+        model.config = ranks.share(model.config)  # calibration may have set a distance of outliers
         ranks.share_weights(model)
         decoders = decoders_of(model, ranks.share(cascade))
         scores, answers = evaluate(model, decoders, test_pairs, config.learning.batch_size, ranks)
@@ -286,10 +286,7 @@ def evaluate(
     for method in decoders:
         together = {k: answer for of_rank in everyone for k, answer in of_rank[method].items()}
         answers[method] = [together[k] for k in range(len(pairs))]
-    scores = {
-        method: [score_pair(pair, answer) for pair, answer in zip(pairs, of_method, strict=True)]
-        for method, of_method in answers.items()
-    }
+    scores = {method: score_pairs(pairs, of_method) for method, of_method in answers.items()}
     return scores, answers
 
 
