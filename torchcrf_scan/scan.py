@@ -143,6 +143,7 @@ class Annotation:
         motions: (K+1, 3) `T_target_source` of every cluster; a NaN row where the object is not in this pair.
         body: (n,) cluster of the object hit by the beam, also without a counterpart; -1 unknown.
         ignore: (n,) bool, unannotated beams.
+        weight: of the pair in learning, below 1 for labels that are not certain.
     """
 
     association: Ints
@@ -150,6 +151,7 @@ class Annotation:
     motions: Floats
     body: Ints
     ignore: Bools
+    weight: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

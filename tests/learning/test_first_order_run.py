@@ -14,8 +14,9 @@ from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning.checkpoint import Store
 from torchcrf_scan.learning.leaks import TrainedOn
+from torchcrf_scan.learning.run_data import hold_out, load_annotated
 from torchcrf_scan.learning.settings import AugmentConfig, Config, DataConfig, GradientConfig, LearningConfig
-from torchcrf_scan.learning.trainer import flatten, hold_out, load_data, load_weights, settings_of
+from torchcrf_scan.learning.trainer import flatten, load_weights, settings_of
 from torchcrf_scan.model import JointScanCRF
 
 SEED = 33  # of no world that the shipped weights were trained on
@@ -183,7 +184,7 @@ def test_objectives_that_do_not_go_together_are_named() -> None:
 
 def test_one_sequence_cannot_be_held_out_of_itself() -> None:
     config = Config(data=DataConfig(pairs=2, sequences=1), gradient=GradientConfig(objective="unrolled"))
-    train, _ = load_data(config.data)
+    train, _ = load_annotated(config.data)
     with pytest.raises(ValueError, match=r"gradient\.validation: .*at least 2 sequences"):
         hold_out(train, config)
     assert hold_out(train, Config(data=config.data)) == (train, [])

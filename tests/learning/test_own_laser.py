@@ -11,7 +11,7 @@ from torchcrf_scan import JointScanCRF
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning import own_laser
-from torchcrf_scan.learning.own_laser import calibrate_on, folds_of, gains, moved_towards, named, surprise, wrong_points
+from torchcrf_scan.learning.own_laser import Given, calibrate_on, folds_of, gains, moved_towards, named, surprise, wrong_points
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.scan import OUTLIER, ScanPair
 
@@ -96,14 +96,14 @@ def test_shares_lead_from_the_model_s_values_to_the_fitted_ones() -> None:
 
 
 def test_a_mover_s_worth_is_fitted_or_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    folds = folds_of(annotated(3))
-    model, part = own_laser.fit_worth(shipped(), annotated(3), folds)
+    given = Given(annotated(3), folds_of(annotated(3)))
+    model, part = own_laser.fit_worth(shipped(), given)
     assert (part.value, part.is_kept, model) == ("too few examples", False, shipped())
     assert part.before == part.after
     monkeypatch.setattr(own_laser, "FEWEST_MOVERS", 0)
     monkeypatch.setattr(own_laser, "judge_clusters", lambda *_: (torch.zeros(0), torch.zeros(0)))
     monkeypatch.setattr(own_laser, "fit_potential", lambda *_: JointScanCRF().cluster_potential)
-    assert own_laser.fit_worth(shipped(), annotated(3), folds)[1].value.endswith("% of the way")
+    assert own_laser.fit_worth(shipped(), given)[1].value.endswith("% of the way")
 
 
 def test_surprise_is_the_negative_log_likelihood() -> None:
@@ -124,14 +124,14 @@ def test_weights_go_from_the_model_s_own_as_far_as_pairs_left_out_gain() -> None
     model, learning = JointScanCRF.from_pretrained(), LearningConfig(objective="likelihood", predicted_share=0.5, prior=0.3)
     with torch.no_grad():
         model.association_weights["registered_translation"].mul_(0.1)
-    pairs = annotated()
-    fitted, part = own_laser.fit_own_weights(model, pairs, folds_of(pairs), learning)
+    given = Given(annotated(), folds_of(annotated()))
+    fitted, part = own_laser.fit_own_weights(model, given, learning)
     assert part.is_kept
     assert part.after < part.before
     changed = {name for name, value in fitted.state_dict().items() if not torch.equal(value, model.state_dict()[name])}
     assert "association_weights.registered_translation" in changed
     assert all(name.startswith(("association_weights.", "clustering_weights.")) for name in changed)
-    kept, _ = own_laser.fit_own_weights(model, pairs, folds_of(pairs), replace(learning, prior=1e-6))
+    kept, _ = own_laser.fit_own_weights(model, given, replace(learning, prior=1e-6))
     for name, value in kept.state_dict().items():
         torch.testing.assert_close(value, model.state_dict()[name], rtol=1e-3, atol=1e-4)
 

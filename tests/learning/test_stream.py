@@ -1,6 +1,7 @@
 """Pair k of a stream is pair k, whoever asks for it and when."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +40,17 @@ def test_given_pairs_are_drawn_where_not_all_are_fresh() -> None:
     sequences = {pair.sequence for pair in pairs}
     share = np.mean([mixed[k].pair.sequence in sequences for k in range(24)])
     assert 0.2 < share < 0.8
+
+
+def test_uncertain_pairs_are_drawn_as_often_as_their_weight_says() -> None:
+    one, other = simulate_pairs(SimulatorConfig(beams=31), 2, 2, 0)
+    assert one.annotation is not None
+    never = replace(one, annotation=replace(one.annotation, weight=0.0))
+    rarely = replace(one, annotation=replace(one.annotation, weight=0.25))
+    assert {PairStream(GradientConfig(fresh=0.0), [never, other])[k].pair.name for k in range(20)} == {other.name}
+    stream = PairStream(GradientConfig(fresh=0.0), [rarely, other])
+    share = np.mean([stream[k].pair.name == one.name for k in range(200)])
+    assert 0.1 < share < 0.3
 
 
 def test_no_given_pairs_is_an_error_where_they_are_needed() -> None:

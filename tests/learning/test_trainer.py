@@ -16,9 +16,10 @@ from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning.leaks import TrainedOn
+from torchcrf_scan.learning.run_data import load_annotated
 from torchcrf_scan.learning.run_log import WATCHED
 from torchcrf_scan.learning.settings import DataConfig
-from torchcrf_scan.learning.trainer import load_data, pairs_to_draw, versions
+from torchcrf_scan.learning.trainer import pairs_to_draw, versions
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.scan import Scan, ScanPair
@@ -181,14 +182,14 @@ def test_pictures_are_of_the_first_pairs_of_the_first_sequences() -> None:
 
 
 def test_simulated_training_and_test_pairs_share_nothing() -> None:
-    train, test = load_data(DataConfig(simulate_train=("street", "indoor"), simulate_test=("street",), pairs=2, sequences=2))
+    train, test = load_annotated(DataConfig(simulate_train=("street", "indoor"), simulate_test=("street",), pairs=2, sequences=2))
     assert (len(train), len(test)) == (4, 2)
     TrainedOn().plus(train).refuse(test, "data")
     assert len({pair.sequence for pair in train}) == 4
 
 
 def test_no_test_pair_is_no_error() -> None:
-    train, test = load_data(DataConfig(simulate_test=(), pairs=1, sequences=1))
+    train, test = load_annotated(DataConfig(simulate_test=(), pairs=1, sequences=1))
     assert (len(train), len(test)) == (1, 0)
 
 

@@ -9,9 +9,9 @@ import torch
 from support import assert_close, generator, normal
 from torch import Tensor
 
-from torchcrf_scan.inference.pseudo_likelihood import Design
+from torchcrf_scan.inference.pseudo_likelihood import Chain, Design
 from torchcrf_scan.learning.settings import LearningConfig
-from torchcrf_scan.learning.weights_fit import fit_weights, flatten
+from torchcrf_scan.learning.weights_fit import fit_chain, fit_weights, flatten
 
 EXACT = LearningConfig(tolerance=1e-9, max_steps=500)
 
@@ -170,3 +170,32 @@ def test_flatten_keeps_extra_potentials_beside_their_states() -> None:
     assert (both.extra[0, :3] == 0).all()
     assert_close(both.extra[0, 3:][:, [0, 1, 4]], extra[0])
     assert (both.extra[0, 3:, 2:4] == 0).all()
+
+
+def test_a_pair_that_counts_twice_is_as_two_and_one_that_counts_nothing_as_none() -> None:
+    (one, _), (other, _) = make_design(120, seed=0), make_design(80, seed=5)
+    twice, weighed = flatten([one, one]), flatten([one, other], [torch.tensor([2.0]), torch.tensor([0.0])])
+    weights = torch.tensor([0.3, -0.2, 0.5, 0.1]).double()
+    assert_close(weighed.log_likelihood(weights).sum(), twice.log_likelihood(weights).sum(), tolerance=1e-9)
+    live = torch.ones(4).double()
+    spread = lambda d: d.features[d.mask].std(dim=0)  # noqa: E731
+    config = replace(EXACT, prior=1e6)  # so weak that the unit of the prior, the spread of all states, does not matter
+    alone = fit_chain([one], live, config)
+    found = fit_chain([one, other], live, config, counts=[torch.tensor([2.0]), torch.tensor([0.0])])
+    assert_close(found * spread(one), alone * spread(one), tolerance=1e-5)
+
+
+def test_counts_weigh_the_exact_likelihood_of_pairs() -> None:
+    """As a chain that is there twice, so one that counts twice; and one that counts nothing is not there."""
+
+    def chain(seed: int) -> Chain:
+        label = torch.randint(0, 3, (1, 6), generator=generator(seed))
+        return Chain(
+            normal(1, 6, 3, 2, seed=seed), normal(1, 5, 3, 3, 2, seed=seed + 1), torch.ones(1, 6, 3).bool(), label, label > -1
+        )
+
+    one, other = chain(3), chain(8)
+    config, live = replace(EXACT, objective="likelihood", prior=1e3), torch.ones(4).double()
+    twice = fit_chain([one, one, other], live, config)
+    weighed = fit_chain([one, other], live, config, counts=[torch.tensor([2.0]), torch.tensor([1.0])])
+    assert_close(weighed, twice, tolerance=2e-3)

@@ -65,6 +65,7 @@ class Design:
     Attributes:
         features: (B, N, S, W). mask: (B, N, S) possible states. label: (B, N) true state. known: (B, N) annotated nodes.
         extra: (B, N, S) log potentials without a weight, from learned inputs; None: none.
+        counts: (B, N) how much every node counts; None: 1.
     """
 
     features: Tensor
@@ -72,11 +73,13 @@ class Design:
     label: Tensor
     known: Tensor
     extra: Tensor | None = None
+    counts: Tensor | None = None
 
     def log_likelihood(self, weights: Tensor) -> Tensor:
-        """(B, N) log p(true state | neighbours, observation); 0 for unannotated nodes. weights: (W,)."""
+        """(B, N) log p(true state | neighbours, observation), as it counts; 0 for unannotated nodes. weights: (W,)."""
         score = add_log(self.features @ weights, self.extra).masked_fill(~self.mask, -torch.inf)
         chosen = torch.log_softmax(score, dim=-1).gather(-1, self.label[..., None])[..., 0]
+        chosen = chosen if self.counts is None else self.counts * chosen
         return torch.where(self.known, chosen, torch.zeros_like(chosen))
 
     def design(self) -> Design:

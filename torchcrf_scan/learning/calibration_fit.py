@@ -62,18 +62,20 @@ def calibrate(model: JointScanCRF, material: Sequence[Material]) -> None:
 
     The undisturbed scans are used: disturbance moves whole scans, and covariances that account for it would be four to six times
     too large otherwise. Scans dominated by movers are left out if there are others: they are right or wrong as a whole, which the
-    belief of a single point does not reflect. An earlier calibration has no influence. A model of one chain keeps the default.
+    belief of a single point does not reflect; so are pairs with uncertain labels, which the model itself may have given. An
+    earlier calibration has no influence. A model of one chain keeps the default.
     """
     model.calibration.load_state_dict(Calibration().state_dict())
     if not (model.config.has_association and model.config.has_clusters):
         return
     pairs = [pair for part in material for pair in part.pairs]
-    dominated = {id(pair) for pair in pairs if moving_share(pair) > DOMINATED}
-    dominated = dominated if len(dominated) < len(pairs) else set()
+    certain = [pair for pair in pairs if pair.annotation is not None and pair.annotation.weight >= 1] or pairs
+    plain = [pair for pair in certain if moving_share(pair) <= DOMINATED] or certain
+    chosen = {id(pair) for pair in plain}
     parts = []
     for part in material:
         batch = ScanPairBatch.collate(part.pairs).without_truth()
-        parts.append(judge(part.pairs, model(batch, part.start), [id(pair) not in dominated for pair in part.pairs]))
+        parts.append(judge(part.pairs, model(batch, part.start), [id(pair) in chosen for pair in part.pairs]))
     model.calibration.load_state_dict(fit_calibration(Judged.joined(parts)).state_dict())
 
 

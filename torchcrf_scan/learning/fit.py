@@ -34,12 +34,13 @@ Margins = dict[int, Boosters]  # by fold, boosters fitted without it
 
 @dataclass(frozen=True, slots=True)
 class Lesson:
-    """Training material with its plug-ins, prepared for one model."""
+    """Training material with its plug-ins, prepared for one model. counts: (B,) how much every pair counts."""
 
     view: PairView
     start: Start
     plugins: PlugIns
     fold: int
+    counts: Tensor
 
 
 def fit(
@@ -73,10 +74,7 @@ def fit(
         fit_association(model, lessons, margins, config, watch.get("association"))
         predicted = [predict_association(model, lesson, margins[lesson.fold]) for lesson in lessons]
     if has_clusters:
-        features = (clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True))
-        set_weights(
-            model, "clustering", fit_chain(features, live_weights(model.config.features)[1], config, watch.get("clustering"))
-        )
+        fit_clustering(model, lessons, predicted, config, generator, watch.get("clustering"))
     if has_association and has_clusters:
         model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
     return margins
@@ -93,8 +91,7 @@ def refit(model: JointScanCRF, material: Sequence[Material], config: LearningCon
     margins = {lesson.fold: model.boosters for lesson in lessons}
     fit_association(model, lessons, margins, config, None, association)
     predicted = [predict_association(model, lesson, model.boosters) for lesson in lessons]
-    features = (clustering_chain(model, lesson, p, config, generator) for lesson, p in zip(lessons, predicted, strict=True))
-    set_weights(model, "clustering", fit_chain(features, live_weights(model.config.features)[1], config, None, clustering))
+    fit_clustering(model, lessons, predicted, config, generator, None, clustering)
 
 
 def fit_features(
@@ -126,7 +123,23 @@ def fit_association(
     """Fits the weights of the association chain, with out-of-fold margins. around: as in `fit_chain`."""
     make = pseudo_likelihood.association_chain if LOSSES[config.objective].is_exact else pseudo_likelihood.association_design
     features = (make(of.view, of.plugins, model.scales, margins[of.fold], model.config.inference) for of in lessons)
-    set_weights(model, "association", fit_chain(features, live_weights(model.config.features)[0], config, watch, around))
+    live, counts = live_weights(model.config.features)[0], [lesson.counts for lesson in lessons]
+    set_weights(model, "association", fit_chain(features, live, config, watch, around, counts))
+
+
+def fit_clustering(
+    model: JointScanCRF,
+    lessons: Sequence[Lesson],
+    predicted: Sequence[Tensor],
+    config: LearningConfig,
+    generator: torch.Generator,
+    watch: Watch | None,
+    around: Tensor | None = None,
+) -> None:
+    """Fits the weights of the clustering chain. predicted: (B, N) associations of every lesson. around: as in `fit_chain`."""
+    features = (clustering_chain(model, of, own, config, generator) for of, own in zip(lessons, predicted, strict=True))
+    live, counts = live_weights(model.config.features)[1], [lesson.counts for lesson in lessons]
+    set_weights(model, "clustering", fit_chain(features, live, config, watch, around, counts))
 
 
 def fit_one_chain(
@@ -141,7 +154,8 @@ def fit_one_chain(
     inference = model.config.inference
     features = (one_chain(of.view, of.plugins, model.scales, margins[of.fold], inference) for of in lessons)
     live = torch.cat(live_weights(model.config.features))
-    association, clustering = fit_chain(features, live, config, watch).split([len(ASSOCIATION_WEIGHTS), len(CLUSTERING_WEIGHTS)])
+    weights = fit_chain(features, live, config, watch, counts=[lesson.counts for lesson in lessons])
+    association, clustering = weights.split([len(ASSOCIATION_WEIGHTS), len(CLUSTERING_WEIGHTS)])
     set_weights(model, "association", association)
     set_weights(model, "clustering", clustering)
 
@@ -154,7 +168,7 @@ def prepare(model: JointScanCRF, part: Material, config: LearningConfig, generat
     plugins = training_plugins(view.batch, start, config, generator)
     if not model.config.has_clusters:
         plugins, start = pseudo_likelihood.for_background_alone(plugins, view.batch), start.background_alone()
-    return Lesson(view, start, plugins, part.fold)
+    return Lesson(view, start, plugins, part.fold, part.counts)
 
 
 def fit_all_boosters(model: JointScanCRF, lessons: Sequence[Lesson], config: LearningConfig, generator: torch.Generator) -> Margins:

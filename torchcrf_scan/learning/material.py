@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from joblib import Parallel, delayed
+from torch import Tensor
 from tqdm import tqdm
 
 from torchcrf_scan.batch import ScanPairBatch
@@ -31,6 +32,11 @@ class Material:
     start: Start
     fold: int
     pairs: tuple[ScanPair, ...]
+
+    @property
+    def counts(self) -> Tensor:
+        """(B,) how much every pair counts."""
+        return torch.tensor([1.0 if pair.annotation is None else pair.annotation.weight for pair in self.pairs])
 
 
 @dataclass(frozen=True, slots=True)

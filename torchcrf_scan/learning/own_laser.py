@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -36,6 +37,7 @@ DISTANCES = tuple(0.02 * 1.2**k for k in range(28))  # metres, up to 2.7
 AGAIN = (0.25, 0.5, 0.25)  # weights of a distance's errors and its neighbours': one pair must not pick a lucky one
 IN_LOGARITHMS = ("local", "pairwise", "cluster_distance", "outlier_threshold", "gate", "neighbour_weight", "neighbour_distance")
 
+FitPart = Callable[[JointScanCRF, "Given"], tuple[JointScanCRF, "Part"]]
 Values = Mapping[str, Tensor]  # by their name in the model's state
 Fit = Callable[[JointScanCRF, Sequence[ScanPair]], Values | None]  # a part's fitted values; None: too little to fit on
 
@@ -57,28 +59,54 @@ class Part:
     is_kept: bool
 
 
+@dataclass(frozen=True, slots=True)
+class Given:
+    """Pairs to fit on.
+
+    Attributes:
+        pairs: those that are measured, left out in turn. folds: (F,) rows of them, one list a turn.
+        also: pairs with uncertain labels, never left out and never measured.
+    """
+
+    pairs: Sequence[ScanPair]
+    folds: Sequence[list[int]]
+    also: Sequence[ScanPair] = ()
+
+    @property
+    def every(self) -> list[ScanPair]:
+        """All pairs."""
+        return [*self.pairs, *self.also]
+
+    def without(self, fold: Sequence[int]) -> list[ScanPair]:
+        """All but those of a fold."""
+        return [*(pair for k, pair in enumerate(self.pairs) if k not in fold), *self.also]
+
+
 def calibrate_on(
-    model: JointScanCRF, pairs: Sequence[ScanPair], learning: LearningConfig | None = None
+    model: JointScanCRF, pairs: Sequence[ScanPair], learning: LearningConfig | None = None, also: Sequence[ScanPair] = ()
 ) -> tuple[JointScanCRF, list[Part]]:
     """The model fitted to the laser of annotated pairs, and what each part gains on pairs left out.
 
     Args:
         learning: settings of a fit of the weights around the model's own, before everything else; None: they stay.
+        also: pairs with uncertain labels to fit on too. Without others these are left out in turn and measured; then the distance
+            of outliers and the confidences stay, about which the model cannot learn from its own labels.
 
     Raises:
         ValueError: fewer than two pairs, one without annotation, or a model of one chain.
     """
+    is_certain = len(pairs) > 0
+    pairs, also = (pairs, also) if is_certain else (also, ())
     if len(pairs) < 2 or any(pair.annotation is None for pair in pairs):
         raise ValueError(f"pairs: expected two or more annotated pairs, got {len(pairs)}, or one without annotation")
     if not (model.config.has_association and model.config.has_clusters):
         raise ValueError(f"chains: expected joint for a model to calibrate, got {model.config.chains}")
-    folds = folds_of(pairs)
+    given = Given(pairs, folds_of(pairs), also)
+    fits: list[FitPart] = [] if learning is None else [partial(fit_own_weights, learning=learning)]
+    fits += [fit_distance, fit_own_scales, fit_worth, fit_confidences] if is_certain else [fit_own_scales, fit_worth]
     found = []
-    if learning is not None:
-        model, part = fit_own_weights(model, pairs, folds, learning)
-        found.append(part)
-    for fit in (fit_distance, fit_own_scales, fit_worth, fit_confidences):
-        model, part = fit(model, pairs, folds)
+    for fit in fits:
+        model, part = fit(model, given)
         found.append(part)
     return model, found
 
@@ -123,8 +151,9 @@ def with_distance(model: JointScanCRF, metres: float) -> JointScanCRF:
     return other
 
 
-def fit_distance(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
+def fit_distance(model: JointScanCRF, given: Given) -> tuple[JointScanCRF, Part]:
     """The distance with the fewest errors about outliers, kept if the pairs left out have fewer, and not more of any other kind."""
+    pairs = given.pairs
     before = errors(model, pairs)
     tried = np.stack([errors(with_distance(model, metres), pairs) for metres in DISTANCES])  # (distances, P, 3)
 
@@ -134,7 +163,7 @@ def fit_distance(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence
 
     every = range(len(pairs))
     after = before.copy()
-    for fold in folds:
+    for fold in given.folds:
         after[fold] = tried[best([k for k in every if k not in fold]), fold]
     metres = DISTANCES[best(every)]
     is_kept = bool((after.sum(0) <= before.sum(0)).all() and after[:, 1].sum() < before[:, 1].sum())
@@ -142,9 +171,7 @@ def fit_distance(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence
     return (with_distance(model, metres) if is_kept else model), part
 
 
-def fit_own_weights(
-    model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]], learning: LearningConfig
-) -> tuple[JointScanCRF, Part]:
+def fit_own_weights(model: JointScanCRF, given: Given, learning: LearningConfig) -> tuple[JointScanCRF, Part]:
     """The weights of both chains by `fit.refit`, around the model's own."""
 
     def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> Values | None:
@@ -152,10 +179,10 @@ def fit_own_weights(
         refit(other, [Material(batch, of.initialise(batch.without_truth()), 0, tuple(some))], learning)
         return named("association_weights", other.association_weights) | named("clustering_weights", other.clustering_weights)
 
-    return fit_by_share(model, pairs, folds, "weights", fit)
+    return fit_by_share(model, given, "weights", fit)
 
 
-def fit_own_scales(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
+def fit_own_scales(model: JointScanCRF, given: Given) -> tuple[JointScanCRF, Part]:
     """The features' scales by `scales_fit`."""
 
     def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> Values | None:
@@ -164,10 +191,10 @@ def fit_own_scales(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequen
         has_pairs = view.batch.truth is not None and bool((view.batch.truth.association >= 0).any())
         return named("scales", fit_scales([view], [plugins])) if has_pairs else None
 
-    return fit_by_share(model, pairs, folds, "scales", fit)
+    return fit_by_share(model, given, "scales", fit)
 
 
-def fit_worth(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
+def fit_worth(model: JointScanCRF, given: Given) -> tuple[JointScanCRF, Part]:
     """The movers' worth by `selection_fit`."""
 
     def fit(of: JointScanCRF, some: Sequence[ScanPair]) -> Values | None:
@@ -178,22 +205,20 @@ def fit_worth(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[li
         has_both = min(int((is_true == label).sum()) for label in (0, 1)) >= FEWEST_MOVERS
         return named("cluster_potential", fit_potential(of, [material])) if has_both else None
 
-    return fit_by_share(model, pairs, folds, "movers' worth", fit)
+    return fit_by_share(model, given, "movers' worth", fit)
 
 
-def fit_by_share(
-    model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]], name: str, fit: Fit
-) -> tuple[JointScanCRF, Part]:
+def fit_by_share(model: JointScanCRF, given: Given, name: str, fit: Fit) -> tuple[JointScanCRF, Part]:
     """A part of the model fitted on all pairs, at the share of the way that leaves the fewest wrong points on those left out."""
-    before = errors(model, pairs)
+    before = errors(model, given.pairs)
     after = np.tile(before, (len(SHARES), 1, 1))
-    for fold in folds:
-        fitted = fit(model, [pair for k, pair in enumerate(pairs) if k not in fold])
+    for fold in given.folds:
+        fitted = fit(model, given.without(fold))
         for row, share in enumerate(SHARES):
             if fitted is not None:
-                after[row, fold] = errors(moved_towards(model, fitted, share), [pairs[k] for k in fold])
+                after[row, fold] = errors(moved_towards(model, fitted, share), [given.pairs[k] for k in fold])
     best = int(after[..., 0].sum(1).argmin())
-    fitted = fit(model, pairs)
+    fitted = fit(model, given.every)
     is_safe = bool(after[best, :, 2].sum() <= before[:, 2].sum())
     is_kept = fitted is not None and is_safe and gains(before[:, 0], after[best, :, 0])
     told = "too few examples" if fitted is None else f"{100 * SHARES[best]:.0f} % of the way"
@@ -221,13 +246,13 @@ def moved_towards(model: JointScanCRF, fitted: Values, share: float) -> JointSca
 
 
 @torch.no_grad()
-def fit_confidences(model: JointScanCRF, pairs: Sequence[ScanPair], folds: Sequence[list[int]]) -> tuple[JointScanCRF, Part]:
+def fit_confidences(model: JointScanCRF, given: Given) -> tuple[JointScanCRF, Part]:
     """Slopes and offsets of both confidences by `calibration_fit`, at the share of the way with the least surprise left out."""
-    judged = [judge([pair], model(ScanPairBatch.collate([pair]).without_truth())) for pair in pairs]
+    judged = [judge([pair], model(ScanPairBatch.collate([pair]).without_truth())) for pair in given.pairs]
     own = np.stack([of.double().cpu().numpy() for of in (model.calibration.association, model.calibration.cluster)])  # (2, 2)
     before = np.array([surprise(of, own) for of in judged])
     after = np.tile(before, (len(SHARES), 1))
-    for fold in folds:
+    for fold in given.folds:
         fitted = slopes_of([of for k, of in enumerate(judged) if k not in fold])
         for row, share in enumerate(SHARES if fitted is not None else ()):
             after[row, fold] = [surprise(judged[k], own + share * (fitted - own)) for k in fold]

@@ -192,6 +192,9 @@ class DataConfig:
     Attributes:
         train: a file, folder or glob pattern of training pairs, or a list of them.
         test: the same for test pairs.
+        unlabelled: a recording that nobody annotated, or a list of them: pairs of which `ScanStream` is sure over four scans are
+            trained on too, with their confidence as weight (`learning.self_labelled`).
+        unlabelled_pairs: at most so many of each.
         simulate_train: names of simulated `NAMED_WORLDS` to train on too, `pairs` pairs each. For other worlds,
             `torchcrf-scan simulate` writes files.
         simulate_test: names of simulated `NAMED_WORLDS` to test on too; train and test never share a seed.
@@ -202,6 +205,8 @@ class DataConfig:
 
     train: tuple[str, ...] | str = ()
     test: tuple[str, ...] | str = ()
+    unlabelled: tuple[str, ...] | str = ()
+    unlabelled_pairs: Annotated[int, Within(1, 100_000)] = 60
     simulate_train: tuple[World, ...] = ("street",)
     simulate_test: tuple[World, ...] = ("street",)
     pairs: Annotated[int, Within(1, 100_000)] = 31

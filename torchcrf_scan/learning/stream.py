@@ -39,7 +39,7 @@ class PairStream(Dataset[Sample]):
 
     Args:
         config: worlds, shares, augmentation and seed.
-        pairs: annotated pairs that `1 - config.fresh` of the samples are drawn from.
+        pairs: annotated pairs that `1 - config.fresh` of the samples are drawn from, each as often as its weight says.
     """
 
     def __init__(self, config: GradientConfig, pairs: Sequence[ScanPair] = ()) -> None:
@@ -47,6 +47,8 @@ class PairStream(Dataset[Sample]):
             raise ValueError(f"gradient.fresh: expected 1 without training pairs, got {config.fresh}")
         self.config = config
         self.pairs = tuple(pairs) if config.fresh < 1 else ()
+        weights = torch.tensor([pair.annotation.weight for pair in self.pairs if pair.annotation], dtype=torch.float64)
+        self.weights = weights if bool((weights != 1).any()) else None  # equal ones draw as they always did
 
     def __getitem__(self, index: int) -> Sample:
         generator = torch.Generator().manual_seed(seed_of(self.config.seed, index))
@@ -57,6 +59,8 @@ class PairStream(Dataset[Sample]):
     def _draw(self, index: int, generator: torch.Generator) -> ScanPair:
         is_fresh = float(torch.rand((), generator=generator)) < self.config.fresh
         places = self.config.worlds if is_fresh else self.pairs
+        if not is_fresh and self.weights is not None:
+            return self.pairs[int(torch.multinomial(self.weights, 1, generator=generator))]
         place = int(torch.randint(len(places), (), generator=generator))
         if not is_fresh:
             return self.pairs[place]

@@ -22,9 +22,6 @@ from tqdm import tqdm
 from torchcrf_scan.baselines.cascade import Cascade
 from torchcrf_scan.baselines.start import match_start
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.data.dataset import PairFiles, split_by_sequence
-from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.data.worlds import NAMED_WORLDS
 from torchcrf_scan.evaluation.metrics import PairScore, score_pairs
 from torchcrf_scan.evaluation.report import report
 from torchcrf_scan.evaluation.summary import summarise
@@ -35,15 +32,15 @@ from torchcrf_scan.learning.cascade_fit import fit_cascade
 from torchcrf_scan.learning.checkpoint import Store, load_weights
 from torchcrf_scan.learning.fit import fit
 from torchcrf_scan.learning.gradient import train_by_gradient
-from torchcrf_scan.learning.leaks import TrainedOn
 from torchcrf_scan.learning.material import Material, collect
 from torchcrf_scan.learning.monitor import TrainingMonitor
 from torchcrf_scan.learning.own_laser import calibrate_on
 from torchcrf_scan.learning.own_start import own_starts, start_anew
 from torchcrf_scan.learning.ranks import ALONE, Ranks, join
+from torchcrf_scan.learning.run_data import RunData, load
 from torchcrf_scan.learning.run_log import WATCHED, RunLog, one_error
 from torchcrf_scan.learning.selection_fit import fit_potential
-from torchcrf_scan.learning.settings import AugmentConfig, Config, DataConfig
+from torchcrf_scan.learning.settings import AugmentConfig, Config
 from torchcrf_scan.learning.staged_watch import StagedWatch
 from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
@@ -53,7 +50,6 @@ from torchcrf_scan.whole_file import write_whole
 
 log = logging.getLogger(__name__)
 
-TEST_SEED = 10_000  # first seed of simulated test worlds, far from those of training
 Decoder = Callable[[ScanPairBatch, Start], Prediction]
 
 
@@ -72,19 +68,11 @@ def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]
 
 def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dict[str, list[PairScore]]:
     """This process's share of `train`."""
-    trained_on = TrainedOn.of_model(config.init)  # fails early if there is no such model
     folder, resolved = Path(config.output), yaml.safe_dump(asdict(config), sort_keys=False)
     folder.mkdir(parents=True, exist_ok=True)
-    train_pairs, test_pairs = load_data(config.data)
+    data = load(config, ranks)
     if config.overfit:
-        train_pairs = test_pairs = train_pairs[:1]
         config = replace(config, gradient=replace(config.gradient, fresh=0.0, augment=AugmentConfig.nothing()))
-    else:
-        TrainedOn().plus(train_pairs).refuse(test_pairs, "data")
-        trained_on.refuse(test_pairs, f"init {config.init}")
-    trained_on = trained_on.plus(train_pairs)
-    train_pairs, held_out = hold_out(train_pairs, config)
-    log.info("%d training pairs, %d validation pairs, %d test pairs", len(train_pairs), len(held_out), len(test_pairs))
 
     began = time.perf_counter()
     store = Store(folder, settings_of(config))
@@ -98,32 +86,32 @@ def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dic
     with RunLog(folder) if ranks.is_first else nullcontext() as run:
         model = JointScanCRF(config.model)
         watch = StagedWatch(run) if run is not None else None
-        material = prepare(model, train_pairs, config, watch, state) if watch is not None and not config.fits_init else []
+        material = prepare(model, data.learned, config, watch, state) if watch is not None and not config.fits_init else []
         if config.has_steps:
             ranks.share_weights(model)
             first_step = state["step"] + 1 if state else None
             with TrainingMonitor(folder, config, first_step) if ranks.is_first else nullcontext() as monitor:
-                train_by_gradient(model, config, train_pairs, held_out, store, ranks, monitor, state=state)
+                train_by_gradient(model, config, data.learned, data.held_out, store, ranks, monitor, state=state)
         cascade = None
         if run is not None:
             if config.has_steps and config.gradient.refit_potential and model.config.has_association and model.config.has_clusters:
                 model.cluster_potential.load_state_dict(fit_potential(model, material).state_dict())
             if config.fits_init:
-                model = fit_own(model, train_pairs, config)
+                model = fit_own(model, data, config)
             else:
                 calibrate(model, material)
                 cascade = fit_baselines(material, config, run)
             model.save_pretrained(folder / "model")
-            trained_on.write(folder / "model")
+            data.trained_on.write(folder / "model")
             log.info("fitted in %.0f s", time.perf_counter() - began)
         model.config = ranks.share(model.config)  # calibration may have set a distance of outliers
         ranks.share_weights(model)
         decoders = decoders_of(model, ranks.share(cascade))
-        scores, answers = evaluate(model, decoders, test_pairs, config.learning.batch_size, ranks)
+        scores, answers = evaluate(model, decoders, data.test, config.learning.batch_size, ranks)
         if run is None:
             return scores
         tables = report(scores) if scores["joint"] else []
-        show(run, watch, model, test_pairs, answers["joint"], config)
+        show(run, watch, model, data.test, answers["joint"], config)
         run.tables("final", tables)
     if config.has_steps and scores["joint"]:
         with TrainingMonitor(folder, config, config.gradient.steps + 1) as monitor:
@@ -150,28 +138,14 @@ def show(
         run.settings(flatten(config), [f"accuracy/{name}" for name in WATCHED] if pairs and watch.paths else [])
 
 
-def fit_own(model: JointScanCRF, pairs: Sequence[ScanPair], config: Config) -> JointScanCRF:
+def fit_own(model: JointScanCRF, data: RunData, config: Config) -> JointScanCRF:
     """The model of `config.init` fitted to the pairs: what is kept is what helps on those left out in turn."""
     load_weights(model, config.init)
-    fitted, parts = calibrate_on(model, pairs, config.staged)
+    fitted, parts = calibrate_on(model, data.train, config.staged, data.uncertain)
     for part in parts:
         told = "kept" if part.is_kept else "not kept, as pairs left out do not gain"
         log.info("%s (%s): %.0f %s left out, then %.0f: %s", part.name, part.value, part.before, part.measure, part.after, told)
     return fitted
-
-
-def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], list[ScanPair]]:
-    """Training and validation pairs, sequences whole; all for training without first-order training.
-
-    Raises:
-        ValueError: too few sequences to hold one out.
-    """
-    if not config.has_steps or config.gradient.validation == 0 or config.overfit:
-        return pairs, []
-    try:
-        return split_by_sequence(pairs, config.gradient.validation, config.gradient.seed)
-    except ValueError as error:
-        raise ValueError(f"gradient.validation: {error}") from error
 
 
 def prepare(
@@ -213,24 +187,6 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
         value, name = getattr(config, of.name), prefix + of.name
         found |= flatten(value, f"{name}.") if is_dataclass(value) else {name: value}
     return found
-
-
-def load_data(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
-    """Training and test pairs: files, then simulated worlds."""
-    if not config.train and not config.simulate_train:
-        raise ValueError("data.simulate_train: expected a world at least where data.train names no files, got none")
-
-    def load(patterns: tuple[str, ...] | str, worlds: tuple[str, ...], seed: int) -> list[ScanPair]:
-        patterns = (patterns,) if isinstance(patterns, str) else patterns
-        pairs = list(PairFiles(*patterns)) if patterns else []
-        for k, world in enumerate(worlds):
-            pairs += simulate_pairs(NAMED_WORLDS[world], config.pairs, config.sequences, seed + k)
-        return pairs
-
-    return (
-        load(config.train, config.simulate_train, config.seed),
-        load(config.test, config.simulate_test, config.seed + TEST_SEED),
-    )
 
 
 def fit_baselines(material: list[Material], config: Config, run: RunLog) -> Cascade | None:

@@ -20,8 +20,11 @@ AnyChain = TypeVar("AnyChain", Chain, LatticeChain)
 Watch = Callable[[int, float, float, Tensor], None]
 
 
-def flatten(designs: Sequence[Design]) -> Design:
-    """All annotated nodes of many batches as one row of nodes: features (1, P, S, W), float64."""
+def flatten(designs: Sequence[Design], counts: Sequence[Tensor] | None = None) -> Design:
+    """All annotated nodes of many batches as one row of nodes: features (1, P, S, W), float64.
+
+    counts: (B,) how much every pair of every batch counts; None: 1.
+    """
     states = max(design.features.shape[2] for design in designs)
 
     def spread(values: Tensor) -> Tensor:
@@ -37,7 +40,13 @@ def flatten(designs: Sequence[Design]) -> Design:
 
     parts = [rows(design) for design in designs]
     features, mask, label, extra = (torch.cat([part[k] for part in parts])[None] for k in range(4))
-    return Design(features, mask, label, torch.ones_like(label, dtype=torch.bool), extra)
+    known = torch.ones_like(label, dtype=torch.bool)
+    return Design(features, mask, label, known, extra, None if counts is None else of_nodes(designs, counts)[None])
+
+
+def of_nodes(designs: Sequence[Design], of_pairs: Sequence[Tensor]) -> Tensor:
+    """(P,) values of all annotated nodes of many batches. of_pairs: (B,) of every batch."""
+    return torch.cat([own[:, None].expand(of.known.shape)[of.known].double() for of, own in zip(designs, of_pairs, strict=True)])
 
 
 def fit_chain(
@@ -46,6 +55,7 @@ def fit_chain(
     config: LearningConfig,
     watch: Watch | None = None,
     around: Tensor | None = None,
+    counts: Sequence[Tensor] | None = None,
 ) -> Tensor:
     """The weights of a chain or the lattice by `config.objective`: pseudo-likelihood, or exact likelihood started at its optimum.
 
@@ -53,13 +63,14 @@ def fit_chain(
         chains: batches; pseudo-likelihood processes one at a time and keeps no transitions, of which dense chains have many.
         live: (W,) 1 for the weights that are learned, 0 for those that stay.
         around: (W,) mean of the prior, where those stay; None: 0.
+        counts: (B,) how much every pair of every batch counts; None: 1.
 
     Returns:
         (W,) float64.
     """
     is_exact = LOSSES[config.objective].is_exact
     chains = list(chains) if is_exact else chains
-    design = flatten([chain.design() for chain in chains])
+    design = flatten([chain.design() for chain in chains], counts)
     done = 0
 
     def look(step: int, loss: float, slope: float, weights: Tensor) -> None:
@@ -72,7 +83,8 @@ def fit_chain(
     if not is_exact:
         return weights
     exact = stack([chain for chain in chains if not isinstance(chain, Design)])
-    measure = lambda w: exact.log_likelihood(w).sum()  # noqa: E731
+    of_pairs = torch.ones(()) if counts is None else torch.cat(list(counts)).double()
+    measure = lambda w: (of_pairs * exact.log_likelihood(w)).sum()  # noqa: E731
     return fit_weights(design, config, look, live=live, start=weights, log_likelihood=measure, around=around)
 
 
