@@ -20,6 +20,7 @@ import sys
 from collections.abc import Sequence
 
 from torchcrf_scan.commands.failures import one_line
+from torchcrf_scan.commands.parser import CommandParser
 from torchcrf_scan.evaluation.report import report
 from torchcrf_scan.experiment.parser import config_of, settings_parser
 from torchcrf_scan.learning.trainer import train
@@ -27,7 +28,7 @@ from torchcrf_scan.learning.trainer import train
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Parses the settings, trains and prints the tables. Returns 0, or 1 for bad input; bad settings exit with code 2."""
-    parser = settings_parser(description=__doc__)
+    parser = settings_parser(CommandParser, description=__doc__)
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the run folder")
     settings = parser.parse_args(argv)
     try:

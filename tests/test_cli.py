@@ -82,7 +82,7 @@ def test_a_mistyped_option_is_told_with_the_right_one(
         (["match", "a.npz"], "output"),
         (["match", "--output", "b"], "files"),
         (["match", "a.npz", "--output", "b", "--candidates", "many"], "candidates"),
-        (["match", "a.log", "--output", "b", "--every", "1.5"], "every"),
+        (["match", "a.log", "--output", "b", "--every", "1.5"], "--every: expected a whole number, got 1.5"),
         (["evaluate"], "pair_files"),
         (["evaluate", "a.npz", "--frame_turn", "some"], "frame_turn"),
         (["plot", "a.log", "--number", "last", "--output", "c.png"], "number"),
@@ -96,4 +96,7 @@ def test_bad_usage_exits_with_2(arguments: list[str], message: str, capsys: pyte
     with pytest.raises(SystemExit) as stop:
         run(*arguments)
     assert stop.value.code == 2
-    assert message in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert message in said
+    assert len(said.splitlines()) == 1
+    assert said.startswith("torchcrf-scan")

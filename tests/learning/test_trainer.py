@@ -198,6 +198,7 @@ def test_no_test_pair_is_no_error() -> None:
     [
         (["--data.simulate_train=[]"], "data.simulate_train: expected a world at least where data.train names no files, got none"),
         (["--data.train=/nosuch"], "/nosuch: no such file or folder"),
+        (["--data.unlabelled=/nosuch.log"], "[Errno 2] No such file or directory: '/nosuch.log'"),
         (["--init=nosuch", "--gradient.objective=unrolled"], "name_or_path: expected a folder with config.json or one of"),
     ],
 )
@@ -209,12 +210,33 @@ def test_bad_input_is_one_line(arguments: list[str], message: str, tmp_path: Pat
     assert not (tmp_path / "config.yaml").exists()
 
 
-def test_bad_settings_are_bad_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--data.pairs=0"], "data.pairs: expected a whole number in [1, 100000], got 0"),
+        (["--learning.prior=nan"], "--learning.prior: expected a finite number, got nan"),
+        (["--learning.priro=1"], "did you mean --learning.prior instead of --learning.priro?"),
+        (["--config=binary.yaml"], "--config: expected a YAML file, got one that is no text"),
+        (["--config=cut.yaml"], "Problems parsing config: while parsing a flow sequence"),
+        (["--config=none.yaml"], "File does not exist"),
+        (["--output="], "output: expected a folder, got an empty name"),
+    ],
+)
+def test_bad_settings_are_bad_usage_in_one_line(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "cut.yaml").write_text("data: [1")
+    before = sorted(tmp_path.iterdir())
     with pytest.raises(SystemExit) as left:
-        load_main()(["--data.pairs=0", f"--output={tmp_path / 'run'}"])
+        load_main()(arguments)
     assert left.value.code == 2
-    assert "error: data.pairs: expected a whole number in [1, 100000], got 0" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
+    said = capsys.readouterr().err
+    assert message in said
+    assert ": error: " in said
+    assert len(said.splitlines()) == 1
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_a_shipped_model_is_fitted_to_a_few_pairs(tmp_path: Path) -> None:

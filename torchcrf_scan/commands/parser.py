@@ -1,27 +1,46 @@
-"""The argument parser of all commands: a mistyped option is answered with the nearest one."""
+"""The argument parser of all commands: bad usage is told in one line, a mistyped option with the nearest right one."""
 
 from __future__ import annotations
 
-from typing import NoReturn
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
 
 from jsonargparse import ArgumentParser
 
 ALIKE = 60.0  # of 100, the least likeness of an option that may have been meant
 UNKNOWN = "unrecognized arguments: "
+MISTYPED = re.compile(r"Parser key \"(\S+)\":\s+Expected an? <class '(\w+)'>\. Got value: (.*)", re.DOTALL)
+KINDS = {"int": "a whole number", "float": "a finite number", "bool": "true or false"}
 
 
 class CommandParser(ArgumentParser):
-    """An `ArgumentParser` that suggests options."""
+    """An `ArgumentParser` whose errors are one line each."""
+
+    def parse_args(self, args: Sequence[str] | None = None, *more: Any, **options: Any) -> Any:  # type: ignore[override]
+        """As in jsonargparse; a file of settings that is no text is bad usage, too."""
+        try:
+            return super().parse_args(args, *more, **options)
+        except UnicodeDecodeError as error:
+            self.error(f"--config: expected a YAML file, got one that is no text ({error})", error)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        """Ends with a usage error; an unknown option is told with the nearest right one of the command."""
+        """Ends with exit code 2 and one line; an unknown option is told with the nearest right one of the command."""
+        parser = getattr(ex, "subcommand_parser", None) or self
         if message.startswith(UNKNOWN):
-            parser = getattr(ex, "subcommand_parser", None) or self
             message += meant(
                 message.removeprefix(UNKNOWN).split(),
                 [option for option in parser._option_string_actions if option.startswith("--")],
             )
-        super().error(message, ex)
+        if wrong := MISTYPED.fullmatch(message):
+            name, kind, value = wrong.groups()
+            message = f"--{name}: expected {KINDS.get(kind, kind)}, got {value}"
+        if not self.exit_on_error:
+            super().error(message, ex)
+        program = parser.prog.replace(" [options]", "")
+        print(f"{program}: error: {' '.join(message.split())} ({program} --help lists all options)", file=sys.stderr)
+        raise SystemExit(2)
 
 
 def meant(words: list[str], options: list[str]) -> str:
