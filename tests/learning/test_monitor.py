@@ -1,5 +1,6 @@
 """What first-order training writes for TensorBoard, read back with TensorBoard's own reader."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
+from torchcrf_scan.learning import run_log
 from torchcrf_scan.learning.checkpoint import Store
 from torchcrf_scan.learning.gradient import train_by_gradient
 from torchcrf_scan.learning.monitor import TrainingMonitor, belief_changes, boosted_margins, named_weights
@@ -97,8 +99,13 @@ def test_joint_and_baselines_are_laid_out_in_one_chart(events: EventAccumulator)
     (event,) = events.Tensors("custom_scalars__config__")
     layout = layout_pb2.Layout.FromString(event.tensor_proto.string_val[0])
     charts = {chart.title: list(chart.multiline.tag) for category in layout.category for chart in category.chart}
-    assert charts["cluster_accuracy"] == ["accuracy/cluster_accuracy/.*"]
-    assert charts["training and validation"] == ["loss/total", "validation/total"]
+    assert charts["ego_success"] == ["motion/ego_success/.*"]
+    assert not {*charts} & {*run_log.LAYOUT["what one watches"]}  # TensorBoard merges both layouts
+    watched = {name: patterns for name, (_, patterns) in run_log.LAYOUT["what one watches"].items()}
+    lines = [tag for tag in events.Tags()["scalars"] if any(re.match(pattern, tag) for pattern in watched["cluster_accuracy"])]
+    assert len(lines) == 3
+    losses = [tag for tag in events.Tags()["scalars"] if any(re.match(pattern, tag) for pattern in watched["loss"])]
+    assert losses == ["loss/total", "validation/total"]
 
 
 def test_settings_stand_beside_what_came_of_them(events: EventAccumulator) -> None:

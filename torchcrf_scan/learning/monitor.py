@@ -40,13 +40,8 @@ log = logging.getLogger(__name__)
 P = ParamSpec("P")
 
 LAYOUT = {
-    "loss": {"training and validation": ["Multiline", ["loss/total", "validation/total"]]},
-    **{
-        f"joint and baselines: {group}": {name: ["Multiline", [f"{group}/{name}/.*"]] for name in names}
-        for group, names in GROUPS.items()
-    },
-    "weights": {chain: ["Multiline", [f"weights/{chain}/.*"]] for chain in ("association", "clustering")},
-}
+    group: {name: ["Multiline", [f"{group}/{name}/.*"]] for name in GROUPS[group]} for group in ("motion", "calibration")
+}  # beside that of `run_log`, which TensorBoard merges with it
 DATA, OUTLIER = len(LOCAL_CHANNELS), len(LOCAL_CHANNELS) + 1  # columns of the boosted margins among the unary features
 
 

@@ -32,8 +32,8 @@ GROUPS = {
 WATCHED = GROUPS["accuracy"]  # by the staged fit, which looks a few times only
 LAYOUT = {
     "what one watches": {
+        "loss": ["Multiline", ["objective/.*", "loss/total", "validation/total"]],
         **{name: ["Multiline", [f"accuracy/{name}"]] for name in WATCHED},
-        "objective": ["Multiline", ["objective/.*"]],
         "gradient": ["Multiline", ["gradient/.*"]],
     },
     "weights": {chain: ["Multiline", [f"weights/{chain}/.*"]] for chain in ("association", "clustering")},
