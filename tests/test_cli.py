@@ -1,5 +1,7 @@
 """The command line as its users meet it: help, one clear line for every mistake, and a package that imports fast."""
 
+import re
+import shutil
 import subprocess
 import sys
 from dataclasses import fields
@@ -36,9 +38,9 @@ def test_public_names_are_there() -> None:
 # --- usage --------------------------------------------------------------------------------------------------------------------
 
 
-def help_of(capsys: pytest.CaptureFixture[str], *command: str) -> str:
+def help_of(capsys: pytest.CaptureFixture[str], *command: str, option: str = "--help") -> str:
     with pytest.raises(SystemExit) as stop:
-        run(*command, "--help")
+        run(*command, option)
     assert stop.value.code == 0
     return capsys.readouterr().out
 
@@ -100,3 +102,23 @@ def test_bad_usage_exits_with_2(arguments: list[str], message: str, capsys: pyte
     assert message in said
     assert len(said.splitlines()) == 1
     assert said.startswith("torchcrf-scan")
+
+
+def test_a_shell_completes_commands_and_options(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    pytest.importorskip("shtab", reason="completion needs shtab (extra `completion`)")
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("no bash")
+    script = tmp_path / "completion.bash"
+    script.write_text(help_of(capsys, option="--print_completion=shtab-bash"))
+
+    def completed(*words: str) -> set[str]:
+        (function,) = re.findall(r"^complete .*-F (\S+) torchcrf-scan$", script.read_text(), re.MULTILINE)
+        line = f"source {script}; COMP_WORDS=({' '.join(map(repr, words))}); COMP_CWORD={len(words) - 1}; {function}"
+        done = subprocess.run(
+            [bash, "-c", f'{line} torchcrf-scan; printf "%s\\n" "${{COMPREPLY[@]}}"'], capture_output=True, text=True
+        )
+        return set(done.stdout.split())
+
+    assert completed("torchcrf-scan", "ma") == {"match"}
+    assert "--outlier_distance" in completed("torchcrf-scan", "match", "--out")

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
-from jsonargparse import ActionYesNo
+from jsonargparse import ActionYesNo, set_parsing_settings
 
 from torchcrf_scan import __version__
 from torchcrf_scan.commands.annotate import annotate
@@ -108,6 +108,7 @@ def arguments_of(command: Callable[..., int], values: dict[str, Any]) -> dict[st
 
 def make_parser() -> CommandParser:
     """The parser of all commands."""
+    set_parsing_settings(add_print_completion_argument=True)  # of a shell, where shtab is installed
     description = "Associations, moving objects and motions between two consecutive planar laser scans."
     parser = CommandParser(prog="torchcrf-scan", description=description, version=__version__)
     subcommands = parser.add_subcommands(dest="command")
