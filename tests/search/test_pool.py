@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from rooms_seen import STILL, right, see_room, sides
 from support import assert_close, generator, normal, polar
 from surveyed import any_scan, array, grids, oracle_of, seen
@@ -16,8 +17,9 @@ from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.data.worlds import MODEL_CARS, SimulatorConfig
+from torchcrf_scan.data.worlds import MODEL_CARS, NAMED_WORLDS, SimulatorConfig
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.loops.pair import pair_of
 from torchcrf_scan.loops.threads import in_parts
 from torchcrf_scan.search.background import (
     POLISH_ALONG,
@@ -36,6 +38,7 @@ from torchcrf_scan.search.pool import (
     GRID_REACH,
     GRID_SHIFTS,
     GRID_TURNS,
+    SEARCHED,
     SEGMENT_ALONG,
     SEGMENT_GATES,
     SLIDE_STEP,
@@ -50,8 +53,10 @@ from torchcrf_scan.search.pool import (
     shifted_from,
     slide,
     start_grid,
+    thinned,
 )
 from torchcrf_scan.search.surface import Surface
+from torchcrf_scan.search.survey import grids_of
 
 SEEDS = st.integers(0, 10_000)
 NONE = np.zeros((0, 3))  # no more starts than the search has by itself
@@ -266,3 +271,24 @@ def test_threads_share_a_search_without_a_trace(street: ScanPairBatch) -> None:
     finally:
         torch.set_num_threads(before)
     assert shared.tolist() == find_background(*sides(street, 0), np.zeros(3)).tolist()
+
+
+@pytest.mark.parametrize("beams", [2881, 3001, 7001])
+def test_a_dense_scan_is_searched_by_some_of_its_points(beams: int) -> None:
+    """The search costs N^2, so the number of its points is bounded; they are spread evenly, and a usual scan is searched whole."""
+    pair = simulate_pairs(replace(NAMED_WORLDS["street"], beams=beams), 1, 1, 3)[0]
+    whole, _ = grids_of(pair_of(ScanPairBatch.collate([pair], torch.float64), 0))
+    some = thinned(whole)
+    assert len(some.features) <= SEARCHED
+    if len(whole.features) <= SEARCHED:
+        assert some is whole
+    else:
+        stride = round(len(whole.features) / len(some.features))
+        assert_array_equal(some.scan.points, whole.scan.points[::stride])
+
+
+def test_the_motion_of_a_dense_scan_is_found() -> None:
+    pair = simulate_pairs(replace(NAMED_WORLDS["street"], beams=7001), 1, 1, 3)[0]
+    assert pair.annotation is not None
+    source, target = grids_of(pair_of(ScanPairBatch.collate([pair], torch.float64), 0))
+    assert_allclose(find_background(source, target, np.zeros(3)), pair.annotation.motions[0], atol=0.02)

@@ -16,10 +16,11 @@ from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.rigid import compose, wrap
 from torchcrf_scan.search.background import background_cost, every, polish, refine, stride_of, unit_length
 from torchcrf_scan.search.cold import shape_motions
-from torchcrf_scan.search.grid import ScanGrid
+from torchcrf_scan.search.grid import ScanGrid, grid_of
 from torchcrf_scan.search.registration import register
-from torchcrf_scan.search.surface import Surface
+from torchcrf_scan.search.surface import Surface, surface_of
 
+SEARCHED = 3000  # points of a scan at most: more tell nothing new of where it was taken
 RANSAC_STARTS = 4
 RANSAC_GATE = 3.0  # units of registration error
 
@@ -199,7 +200,16 @@ def background_pool(source: ScanGrid, target: ScanGrid, guess: Array, extra: Arr
     return pool[distinct(pool, cost, unit / 2, len(pool))]
 
 
+def thinned(grid: ScanGrid) -> ScanGrid:
+    """The grid of every second, third, ... point of a scan of more than `SEARCHED`: the search costs N^2."""
+    scan, stride = grid.scan, stride_of(len(grid.features), SEARCHED)
+    if stride == 1:
+        return grid
+    return grid_of(surface_of(every(scan.points, stride), scan.noise, scan.is_closed, scan.origin))
+
+
 def find_background(source: ScanGrid, target: ScanGrid, guess: Array, share: Share = alone) -> Array:
     """(3,) the background's motion from shapes, a grid of starts and a guess (3,); scans of at least three points."""
+    source, target = thinned(source), thinned(target)
     ransac = shape_motions(source.scan, target.scan, RANSAC_GATE * unit_length(source.scan, target.scan), RANSAC_STARTS)
     return background_pool(source, target, guess, ransac, share)[0]
