@@ -18,6 +18,7 @@ from torchcrf_scan.fast.choice import can_run
 from torchcrf_scan.features.free_space import Sweep, bearing_in, look, rising_turn
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start
+from torchcrf_scan.loops.circle import LEAST_TURN
 from torchcrf_scan.loops.pair import pair_of
 from torchcrf_scan.search.pairs import start_arrays
 
@@ -107,7 +108,7 @@ def cross_channels(side: Side, moved: Tensor, unit: Tensor) -> tuple[Tensor, Ten
     B, C, P = moved.shape[:3]
     sweep = side.other_sweep
     bearing = bearing_in(sweep, moved.flatten(1, 2) - sweep.origin[:, None])  # (B, C P)
-    after = torch.searchsorted(sweep.bearings, bearing.contiguous())
+    after = torch.searchsorted(sweep.bearings, bearing - LEAST_TURN)  # returns on a beam, up to rounding, are not beyond it
     beam, there = along_scan(sweep, after[..., None] + torch.arange(-WINDOW, WINDOW, device=after.device))  # (B, C P, 2 W)
     beam, there = beam.view(B, C, P, -1), there.view(B, C, P, -1)
     arms = side.other.gather(1, beam.view(B, -1, 1).expand(-1, -1, 2)).view(B, C, P, -1, 2) - moved[..., None, :]

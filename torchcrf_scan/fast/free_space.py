@@ -8,13 +8,20 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcrf_scan.features.free_space import SLACK_SHARE, SLACK_STEPS, WIDEST_GAP
-from torchcrf_scan.loops.circle import first_from, polar, rising_bearing, rising_turn, turn_between
+from torchcrf_scan.loops.circle import (
+    LEAST_TURN,
+    USUAL_STEP,
+    first_from,
+    polar,
+    rising_bearing,
+    rising_turn,
+    turn_between,
+    usual_step,
+)
 from torchcrf_scan.loops.jit import Array, kernel
-from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.search.free_space import range_slack
 
 LEAST_SLACK = 1e-6  # of `range_slack`
-USUAL_STEP = math.radians(0.5)  # of a scan with one point
 
 
 class Sweep(NamedTuple):
@@ -39,14 +46,17 @@ def sweep_of(points: Array, noise: float, is_closed: bool, origin: Array) -> Swe
     turns = np.empty(max(len(points) - 1, 0))
     for i in range(len(turns)):
         turns[i] = rising_turn(bearings[i + 1] - bearings[i])
-    return Sweep(origin, ranges, bearings, lower_median(turns) if len(turns) > 0 else USUAL_STEP, noise, is_closed)
+    return Sweep(origin, ranges, bearings, usual_step(turns, USUAL_STEP), noise, is_closed)
 
 
 @kernel
 def beam_after(sweep: Sweep, dx: float, dy: float) -> tuple[float, int]:
-    """Bearing of the direction (dx, dy) on the scale of the sweep's own, and the first beam whose bearing is not less."""
+    """Bearing of the direction (dx, dy) on the scale of the sweep's own, and the first beam whose bearing is not less.
+
+    A beam is not less up to `LEAST_TURN`: where nothing moves, returns lie on beams exactly, and rounding must not choose.
+    """
     bearing = rising_bearing(sweep.bearings[0] if len(sweep.bearings) > 0 else 0.0, sweep.step / 2, dx, dy)
-    return bearing, first_from(sweep.bearings, bearing)
+    return bearing, first_from(sweep.bearings, bearing - LEAST_TURN)
 
 
 @kernel

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchcrf_scan.loops.circle import LEAST_TURN, USUAL_STEP
+
 SLACK_STEPS = 3.0  # tolerance on a range, in beam spacings and noises,
 SLACK_SHARE = 0.02  # and as a share of the range: calibration, tilt
 BACKWARDS = 1e-4  # radians; smaller steps back are rounding errors
@@ -48,8 +50,8 @@ class Sweep:
         turns = rising_turn(torch.atan2(arms[..., 1], arms[..., 0]).diff(dim=1)).masked_fill(~mask[:, 1:], 0.0)  # (B, N-1)
         first = torch.atan2(arms[:, :1, 1], arms[:, :1, 0])
         bearings = torch.cat([first, first + turns.cumsum(1)], dim=1).masked_fill(~mask, torch.inf)
-        known = pad(turns.masked_fill(~mask[:, 1:], torch.nan), (0, 1), value=torch.nan)  # a single point has no step
-        step = known.nanmedian(1).values.nan_to_num(nan=math.radians(0.5))
+        between = turns.masked_fill(~mask[:, 1:] | (turns < LEAST_TURN), torch.nan)  # several returns of one beam have no step
+        step = pad(between, (0, 1), value=torch.nan).nanmedian(1).values.nan_to_num(nan=USUAL_STEP)
         return cls(origin, ranges, bearings, count, closed, step, noise)
 
 

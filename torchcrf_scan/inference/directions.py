@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from torchcrf_scan.geometry.kabsch import safe_atan2
+from torchcrf_scan.loops.circle import LEAST_TURN
 
 STRETCH, STEPS = 10.0, 2.0  # a surface's direction comes from the points within this many noises and steps to the next point
 NEIGHBOURS = 32  # on either side, at most: on a near wall neighbours of a dense scan are much closer than the noise
 MISSING = 4.5  # beams; neighbours farther apart are not on one surface: whatever is between them returned nothing
-LEAST_TURN = 1e-9  # radians; several returns of one beam are not neighbouring beams
 STRAIGHT = 3.0  # noises that the middle one of three neighbours may be off the line through the others
 
 

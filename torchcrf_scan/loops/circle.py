@@ -7,8 +7,11 @@ import math
 import numpy as np
 
 from torchcrf_scan.loops.jit import Array, kernel
+from torchcrf_scan.loops.median import lower_median
 
 BACKWARDS = 1e-4  # radians; smaller steps back are rounding errors
+LEAST_TURN = 1e-9  # radians; several returns of one beam are not neighbouring beams
+USUAL_STEP = math.radians(0.5)  # between beams, if there are not two
 
 
 @kernel
@@ -69,3 +72,17 @@ def first_from(rising: Array, value: float) -> int:
         else:
             count = half
     return low
+
+
+@kernel
+def usual_step(turn: Array, otherwise: float) -> float:
+    """Radians between beams: the lower median of the turns (P,) to the next return, without those within one beam.
+
+    otherwise: for fewer than two beams.
+    """
+    beams, count = np.empty(len(turn)), 0
+    for i in range(len(turn)):
+        if turn[i] >= LEAST_TURN:
+            beams[count] = turn[i]
+            count += 1
+    return lower_median(beams[:count]) if count > 0 else otherwise

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.inference.directions import LEAST_TURN, MISSING, NEIGHBOURS, STEPS, STRAIGHT, STRETCH
+from torchcrf_scan.inference.directions import MISSING, NEIGHBOURS, STEPS, STRAIGHT, STRETCH
+from torchcrf_scan.loops.circle import usual_step
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
-from torchcrf_scan.loops.median import lower_median
 
 
 class Directions(NamedTuple):
@@ -38,24 +38,13 @@ def turns_of(points: Array) -> Array:
 
 
 @kernel
-def usual_turn(turn: Array) -> float:
-    """Radians between beams, the lower median; NaN for fewer than two. turn: (N,) of `turns_of`."""
-    turns, count = np.empty(len(turn)), 0
-    for i in range(len(turn)):
-        if turn[i] >= LEAST_TURN:
-            turns[count] = turn[i]
-            count += 1
-    return lower_median(turns[:count]) if count > 0 else np.nan
-
-
-@kernel
 def surface_runs(points: Array, noise: float) -> Integers:
     """(N,) ascending numbers of the runs of neighbouring beams of which few are missing.
 
     points: (N, 2) in beam order. noise: of a range; neighbours a few noises apart are never cut.
     """
     run, turn = np.zeros(len(points), np.int64), turns_of(points)
-    step = usual_turn(turn)
+    step = usual_step(turn, np.nan)
     for i in range(len(points) - 1):
         gap = math.sqrt((points[i + 1, 0] - points[i, 0]) ** 2 + (points[i + 1, 1] - points[i, 1]) ** 2)
         run[i + 1] = run[i] + (1 if turn[i] > MISSING * step and gap > STRETCH * noise else 0)
@@ -138,5 +127,5 @@ def directions_of(points: Array, mask: Booleans, noise: float) -> Directions:
     """Directions of the surfaces of (N, 2) points in beam order. mask: (N,) points to use."""
     run = surface_runs(points, noise)
     tangent, is_found = surface_tangents(points, mask, noise, run)
-    step = usual_turn(turns_of(points))
+    step = usual_step(turns_of(points), np.nan)
     return Directions(tangent, is_found, is_straight(points, run, noise), spacing_of(points), step)

@@ -8,10 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcrf_scan.features.free_space import WIDEST_GAP
-from torchcrf_scan.inference.directions import LEAST_TURN
-from torchcrf_scan.loops.circle import polar, rising_bearing, rising_turn, turn_apart
+from torchcrf_scan.loops.circle import USUAL_STEP, polar, rising_bearing, rising_turn, turn_apart, usual_step
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, entry, kernel
-from torchcrf_scan.loops.median import lower_median
 from torchcrf_scan.loops.nearest import Boxes, boxes_of
 from torchcrf_scan.search.free_space import range_slack
 
@@ -60,17 +58,6 @@ def number_runs(joined: Booleans) -> Integers:
 
 
 @kernel
-def usual_step(turn: Array) -> float:
-    """Radians: the lower median of the turns (P,) to the next beam, without the last one and those to a return of the same beam."""
-    beams, count = np.empty(len(turn)), 0
-    for i in range(len(turn) - 1):
-        if turn[i] >= LEAST_TURN:
-            beams[count] = turn[i]
-            count += 1
-    return lower_median(beams[:count]) if count > 0 else math.radians(0.5)
-
-
-@kernel
 def distinct_neighbour(i: int, gap: Array, joined: Booleans, direction: int) -> int:
     """The nearest point ahead (1) or behind (-1) of point i on its surface that is elsewhere; the last one tried if there is none.
 
@@ -95,7 +82,7 @@ def surface_of(points: Array, noise: float, is_closed: bool, origin: Array) -> S
         j = (i + 1) % P
         gap[i] = math.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
         turn[i] = rising_turn(bearings[j] - bearings[i])
-    step = usual_step(turn)
+    step = usual_step(turn[: P - 1], USUAL_STEP)
     joined = np.empty(P, np.bool_)
     for i in range(P):
         least = min(ranges[i], ranges[(i + 1) % P])
