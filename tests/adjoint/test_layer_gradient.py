@@ -154,7 +154,7 @@ def test_a_gradient_of_a_gradient_is_refused() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_no_gradient_of_random_batches_is_not_a_number(dtype: torch.dtype) -> None:
     model = JointScanCRF.from_pretrained("simulated", motion_weights="soft", stop_early=False, iterations=2).to(dtype)
-    for seed in range(50):
+    for seed in range(dtype == torch.float64, 50, 2):  # of either type every other one
         names = sorted(WORLDS)
         world = WORLDS[names[seed % len(names)]]
         pairs = simulate_pairs(replace(world, beams=9 + 7 * (seed % 5)), 2, 1, seed)

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -31,9 +32,9 @@ def pair_files(pairs: list[ScanPair], tmp_path_factory: pytest.TempPathFactory) 
     return folder
 
 
-@pytest.fixture
-def serve(pair_files: Path) -> Iterator[Serve]:
-    """Begins to serve the pairs and returns the process and the page's address."""
+@contextmanager
+def serving(pair_files: Path) -> Iterator[Serve]:
+    """Begins to serve the pairs and returns the process and the page's address; ends what has begun."""
     pytest.importorskip("bokeh", reason="the library bokeh is not installed (extra `annotate`)")
     started: list[subprocess.Popen[str]] = []
 
@@ -50,3 +51,17 @@ def serve(pair_files: Path) -> Iterator[Serve]:
     for process in started:
         process.kill()
         process.communicate()
+
+
+@pytest.fixture
+def serve(pair_files: Path) -> Iterator[Serve]:
+    """To begin servers of one's own with."""
+    with serving(pair_files) as start:
+        yield start
+
+
+@pytest.fixture(scope="session")
+def address(pair_files: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The page of a server that nothing is changed at."""
+    with serving(pair_files) as start:
+        yield start(tmp_path_factory.mktemp("served"))[1]

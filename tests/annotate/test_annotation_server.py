@@ -7,14 +7,13 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from serving import Serve
 
 from torchcrf_scan.annotate.keys import ACTIONS
 from torchcrf_scan.cli import main
 
 
-def test_other_hosts_and_origins_are_refused(serve: Serve, tmp_path: Path) -> None:
-    port = urlsplit(serve(tmp_path)[1]).port
+def test_other_hosts_and_origins_are_refused(address: str) -> None:
+    port = urlsplit(address).port
     upgrade = {
         "Connection": "Upgrade",
         "Upgrade": "websocket",
@@ -35,9 +34,8 @@ def test_other_hosts_and_origins_are_refused(serve: Serve, tmp_path: Path) -> No
     assert status("/ws", **upgrade, Origin=f"http://127.0.0.1:{port}") != 404
 
 
-def test_the_page_loads_nothing_from_elsewhere(serve: Serve, tmp_path: Path) -> None:
-    address = urlsplit(serve(tmp_path)[1])
-    with closing(HTTPConnection("127.0.0.1", address.port, timeout=60)) as connection:
+def test_the_page_loads_nothing_from_elsewhere(address: str) -> None:
+    with closing(HTTPConnection("127.0.0.1", urlsplit(address).port, timeout=60)) as connection:
         connection.request("GET", "/")
         page = connection.getresponse().read().decode()
     assert 'src="/static/js/bokeh.min.js' in page

@@ -238,8 +238,10 @@ def test_a_folder_without_the_package_is_refused(tmp_path: Path) -> None:
         beside.compare(street_pairs(31, 1), "simulated", tmp_path, repeats=1)
 
 
-def test_a_process_that_fails_is_told(tmp_path: Path) -> None:
+def test_a_process_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "torchcrf_scan").mkdir()
-    (tmp_path / "torchcrf_scan" / "__init__.py").write_text("raise SystemExit(3)")
+    (tmp_path / "torchcrf_scan" / "__init__.py").touch()
+    ends = f"import os, sys\nif os.environ['PYTHONPATH'] == {str(tmp_path)!r}: sys.exit(3)\n"
+    monkeypatch.setattr(beside, "PROGRAM", ends + "for line in sys.stdin: print(1, flush=True)")  # they begin at once
     with pytest.raises(ValueError, match="ended with 3"):
         beside.compare(street_pairs(31, 1), "simulated", tmp_path, repeats=1)

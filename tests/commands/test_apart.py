@@ -85,6 +85,7 @@ def failing_elsewhere(path: Path) -> None:
         raise OSError("elsewhere")
 
 
+@pytest.mark.usefixtures("fast_start")
 def test_an_error_elsewhere_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="elsewhere"):
         failing_elsewhere(tmp_path / "a")

@@ -16,6 +16,7 @@ from torchcrf_scan.baselines.register import BASELINES, installed
 from torchcrf_scan.experiment import cross_validation, experiment
 from torchcrf_scan.experiment.methods import METHODS
 from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT, LATTICE, LATTICE_EXACT
+from torchcrf_scan.learning.run_log import RunLog
 
 PROTOCOLS = ("leave_one_pair_out", "leave_one_sequence_out")
 TABLES = {PROTOCOLS[0]: 10, PROTOCOLS[1]: 11}  # the second has differences of the exact model too
@@ -26,7 +27,9 @@ SMALL = (
 
 
 def draw_once(patch: pytest.MonkeyPatch, at_first: int = 1) -> None:
-    """Drawing takes time: the first figure of each kind is a real one, the others are blank."""
+    """Drawing takes time: the first figure of each kind is a real one, as a file; the others are blank."""
+    log = RunLog.figure
+    patch.setattr(RunLog, "figure", lambda run, tag, figure: log(run, tag, Figure((0.2, 0.2))))
     for name in ("plot_associations", "plot_association_sequence", "plot_cluster_sequence"):
         real, drawn = getattr(experiment, name), itertools.count()
 

@@ -41,6 +41,7 @@ def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
+@pytest.mark.usefixtures("fast_start")
 def test_run_writes_everything(stream: FakeStream, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("run", log, "--output", tmp_path / "out", "--clean") == 0
     assert names(tmp_path / "out") == ALL | {"clean.log"}

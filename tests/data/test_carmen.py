@@ -245,7 +245,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     lines = [line(list(rng.uniform(1, 9, 180)), (0, 0, 0), k) for k in range(400)]
     peaks = []
-    for times in (1, 10):
+    for times in (1, 4):
         (tmp_path / "run.log.gz").write_bytes(gzip.compress("\n".join(lines * times).encode(), 1))
         tracemalloc.start()
         assert sum(len(reading.scan) for reading in read_carmen(tmp_path / "run.log.gz")) == 400 * 180 * times

@@ -21,7 +21,7 @@ QUIET = replace(STILL, range_noise=0.0, vibration=0.0, dropout=0.0, mixed_pixels
 @pytest.fixture(scope="module", params=TRAINING_WORLDS)
 def named(request: pytest.FixtureRequest) -> tuple[SimulatorConfig, list[ScanPair]]:
     config = TRAINING_WORLDS[request.param]
-    return config, simulate_pairs(config, 6, 3, 17)
+    return config, simulate_pairs(config, 4, 2, 17)
 
 
 def travel(pair: ScanPair, number: int) -> float:

@@ -52,7 +52,7 @@ def elsewhere(mode: FakeTensorMode, module: torch.nn.Module) -> dict[str, Tensor
 @pytest.mark.parametrize("settings", [{}, {"motion_weights": "soft", "motion_metric": "point"}, {"temperature": 1.0}], ids=str)
 def test_rounds_mix_no_devices_and_read_no_value(settings: dict[str, Any]) -> None:
     batch = annotated().without_truth()
-    model = JointScanCRF.from_pretrained(stop_early=False, iterations=2, **settings)
+    model = JointScanCRF.from_pretrained(stop_early=False, iterations=1, clusters=4, **settings)
     start: Start = model.initialise(batch)
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         state = elsewhere(mode, model)

@@ -1,6 +1,8 @@
 """A study of six small pairs and the models of one of its folds, made once for all tests of the experiment."""
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import pytest
 from matplotlib.figure import Figure
@@ -13,6 +15,7 @@ from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.experiment.models import Models, fit_models
 from torchcrf_scan.experiment.settings import ExperimentConfig, RunConfig
 from torchcrf_scan.experiment.study import Study
+from torchcrf_scan.learning import monitor, run_log
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.scan import ScanPair
 
@@ -50,16 +53,40 @@ def models(study: Study, small_config: RunConfig) -> Models:
     return fit_models(study, range(4), small_config, variants=True)
 
 
-@pytest.fixture(scope="module")
-def drawn_once() -> Iterator[None]:
-    """Drawing takes time: of the figures of one name the first is drawn for TensorBoard, the others are blank."""
-    drawn: set[str] = set()
-    real = SummaryWriter.add_figure
+@contextmanager
+def drawing_at_most(most: int) -> Iterator[None]:
+    """Drawing takes most of the time of a small run: so many figures of a kind, and of a tag, are real; the others are blank."""
+    made: Counter[str] = Counter()
+
+    def sparingly(real: Callable[..., Figure], name: str, times: int) -> Callable[..., Figure]:
+        def plot(*given: object) -> Figure:
+            made[name] += 1
+            return real(*given) if made[name] <= times else Figure((8.0, 6.0))
+
+        return plot
 
     def add(writer: SummaryWriter, tag: str, figure: Figure, step: int, close: bool) -> None:
-        real(writer, tag, Figure((0.2, 0.2)) if tag in drawn else figure, step, close)
-        drawn.add(tag)
+        made[tag] += 1
+        draw(writer, tag, figure if made[tag] <= most else Figure((0.2, 0.2)), step, close)
 
+    draw = SummaryWriter.add_figure
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SummaryWriter, "add_figure", add)
+        patch.setattr(run_log, "plot_pair", sparingly(run_log.plot_pair, "pair", 2 * most))  # for TensorBoard, and as a file
+        for name in [name for name in vars(monitor) if name.startswith("plot_")]:
+            patch.setattr(monitor, name, sparingly(getattr(monitor, name), name, most))
+        yield
+
+
+@pytest.fixture(scope="module")
+def drawn_once() -> Iterator[None]:
+    """The first figure of every kind is real."""
+    with drawing_at_most(1):
+        yield
+
+
+@pytest.fixture(scope="module")
+def undrawn() -> Iterator[None]:
+    """All figures are blank."""
+    with drawing_at_most(0):
         yield

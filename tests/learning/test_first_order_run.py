@@ -44,13 +44,13 @@ def arguments(pairs: Path) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def run(arguments: list[str], tmp_path_factory: pytest.TempPathFactory, drawn_once: None) -> Path:
+def run(arguments: list[str], tmp_path_factory: pytest.TempPathFactory, undrawn: None) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "small"
     load_main()([*arguments, f"--output={folder}"])
     return folder
 
 
-@pytest.mark.usefixtures("drawn_once")
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("is_anew", [True, False])
 def test_the_potential_of_movers_is_fitted_anew_or_kept(arguments: list[str], tmp_path: Path, is_anew: bool) -> None:
     own = [of for of in arguments if not of.startswith("--model") and "steps" not in of]

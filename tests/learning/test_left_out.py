@@ -81,7 +81,8 @@ def test_no_fold_has_seen_what_it_leaves_out(
     protocol: str, study: Study, small_pairs: list[ScanPair], small_config: RunConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gates = []
-    for fold in make_folds(protocol, small_pairs, len(small_pairs))[::2]:  # the folds between are fitted by the same lines
+    first, *_, last = make_folds(protocol, small_pairs, len(small_pairs))  # the folds between are fitted by the same lines
+    for fold in (first, last):
         lied_to = Study.of(with_corrupted(small_pairs, fold.test), small_config, jobs=1)
         clean, margins = fit_fold(study, fold.train, small_config, monkeypatch)
         other, _ = fit_fold(lied_to, fold.train, small_config, monkeypatch)

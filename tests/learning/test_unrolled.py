@@ -434,11 +434,11 @@ def test_gradcheck_in_the_points_and_the_start(metric: str) -> None:
 
 
 def test_gradients_are_finite_whatever_the_batch() -> None:
-    """A hundred of the thousand that were tried: empty clusters, one point, all outliers, duplicates, padding.
+    """Fifty of the thousand that were tried: empty clusters, one point, all outliers, duplicates, padding.
 
     The last three once failed: points without a candidate, and weights that float32 can hold but not their squares.
     """
-    for seed in (*range(97), 560, 824, 878):
+    for seed in (*range(47), 560, 824, 878):
         case = random_case(seed, torch.float64 if seed % 2 else torch.float32)
         terms = unrolled_loss(case.model, case.batch, case.config, case.start, **case.inputs)
         assert all(value.isfinite() for value in terms.values()), seed
