@@ -7,7 +7,7 @@ checks all fields when the dataclass is constructed, whether from a command, a f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sized
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from numbers import Integral, Real
@@ -40,6 +40,20 @@ class Within:
         if self.most == math.inf:
             return f" above {self.least}" if self.above else f", {self.least} or more"
         return f" in {'(' if self.above else '['}{self.least}, {self.most}{')' if self.below else ']'}"
+
+
+@dataclass(frozen=True, slots=True)
+class AtMost:
+    """A list of limited length."""
+
+    count: int
+
+    def allows(self, value: Sized) -> bool:
+        """Whether a list is short enough."""
+        return len(value) <= self.count
+
+    def __str__(self) -> str:
+        return f" of at most {self.count}"
 
 
 class OneOf:
@@ -108,8 +122,9 @@ def _converted(name: str, hint: Any, value: Any) -> Any:
     if get_origin(base) in UNIONS:
         base = next(of for of in get_args(base) if _suits(of, value))
     if get_origin(base) is tuple:
-        return tuple(_converted(name, get_args(base)[0], of) for of in value)
-    converted = base(value) if base in (bool, int, float) else value
+        converted = tuple(_converted(name, get_args(base)[0], of) for of in value)
+    else:
+        converted = base(value) if base in (bool, int, float) else value
     if converted is not None and not all(bound.allows(converted) for bound in bounds):
         raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
     return converted

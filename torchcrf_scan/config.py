@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
-from torchcrf_scan.checks import Amount, OneOf, Within, check_fields
+from torchcrf_scan.checks import Amount, AtMost, OneOf, Within, check_fields
 from torchcrf_scan.choices import (
     CANDIDATE_SEARCHES,
     CHAINS,
@@ -139,9 +139,9 @@ class EncoderConfig:
         embedding: channels of its embeddings, in addition to its log potentials; needs `features.embedding`; 0: none.
     """
 
-    width: Annotated[int, Within(0, 4096)] = 0
-    dilations: tuple[Annotated[int, Within(1, 10_000)], ...] = (1, 2, 4, 8, 16)
-    embedding: Annotated[int, Within(0, 4096)] = 0
+    width: Annotated[int, Within(0, 1024)] = 0
+    dilations: Annotated[tuple[Annotated[int, Within(1, 10_000)], ...], AtMost(16)] = (1, 2, 4, 8, 16)
+    embedding: Annotated[int, Within(0, 1024)] = 0
 
     def __post_init__(self) -> None:
         check_fields(self, "encoder.")

@@ -21,6 +21,7 @@ from torchcrf_scan.beams import FARTHEST, Bools, Floats, Ints, bearings_of, chec
 BACKGROUND = 0
 OUTLIER = -1
 MAX_RANGE_MARGIN = 0.05  # spec 0.2: a range this close to range_max is a beam without return
+SHORTEST, LONGEST = 1e-6, 1e9  # seconds between two scans; what is beyond would not survive single precision as a speed
 CLOSED_SPAN = float(np.radians(315.0))  # a scan that spans at least this much has neighbours across +-180 deg (A-06)
 
 
@@ -154,7 +155,7 @@ class Annotation:
 
 @dataclass(frozen=True, slots=True)
 class ScanPair:
-    """Two consecutive scans `dt` > 0 seconds apart, with or without annotation.
+    """Two consecutive scans `dt` seconds apart, `SHORTEST` to `LONGEST`, with or without annotation.
 
     `sequence` names the recording (pairs of one sequence overlap in time: never split one between training and test), `name`
     the pair, `origin` where the data comes from. `initial_motion` (3,) is a guess of the background's `T_target_source`, from
@@ -171,8 +172,8 @@ class ScanPair:
     initial_motion: Floats | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.dt < np.inf:
-            raise ValueError(f"dt: expected a finite number of seconds above 0, got {self.dt}")
+        if not SHORTEST <= self.dt <= LONGEST:
+            raise ValueError(f"dt: expected seconds between {SHORTEST:g} and {LONGEST:g}, got {self.dt}")
 
 
 @dataclass(frozen=True, slots=True)

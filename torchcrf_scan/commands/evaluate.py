@@ -20,6 +20,7 @@ from torchcrf_scan.commands.causes import explain
 from torchcrf_scan.commands.frames import FrameOffset, Turn, match_displaced
 from torchcrf_scan.commands.rounds import tell_rounds
 from torchcrf_scan.commands.sequences import by_sequence, figures_of, rows_of, without_nan
+from torchcrf_scan.data.formats import PAIR, find_format
 from torchcrf_scan.data.pair_file import read_pair, read_prediction
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
@@ -171,7 +172,12 @@ def _displacement(metres: float | None, turn: Turn | None, predictions: str | No
 
 
 def _annotated_pairs(patterns: Sequence[str]) -> dict[Path, ScanPair]:
-    pairs = {path: read_pair(path) for path in find_files(patterns)}
+    files = find_files(patterns)
+    for path in files:
+        form = find_format(path)
+        if form is not None and form is not PAIR:
+            raise ValueError(f"{path}: expected an annotated pair file (.npz), got a {form.name}, which has no annotation")
+    pairs = {path: read_pair(path) for path in files}
     for path, pair in pairs.items():
         if pair.annotation is None:
             raise ValueError(f"{path}: expected an annotated pair (keys association and cluster), got one without")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from torchcrf_scan.data.limits import MOST_ARRAY
+from torchcrf_scan.data.limits import MOST_ARCHIVE, MOST_ARRAY
 
 ZIP = b"PK\x03\x04"
 
@@ -20,12 +21,14 @@ def read_arrays(path: Path, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
     """The arrays of those keys that an archive holds.
 
     Raises:
-        ValueError: another format, a damaged or cut archive, an array of objects or beyond `MOST_ARRAY`.
+        ValueError: another format, a damaged or cut archive, one beyond `MOST_ARCHIVE`, an array of objects or beyond `MOST_ARRAY`.
         OSError: the file cannot be opened.
     """
     with open(path, "rb") as file:
         if file.read(len(ZIP)) != ZIP:
             raise ValueError(f"{path}: expected a complete .npz archive, got another kind of file")
+        if (size := os.fstat(file.fileno()).st_size) > MOST_ARCHIVE:
+            raise ValueError(f"{path}: expected at most {MOST_ARCHIVE} bytes, got {size}")
         try:
             with zipfile.ZipFile(file) as archive:
                 held = {name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")}

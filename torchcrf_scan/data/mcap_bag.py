@@ -99,8 +99,9 @@ def _walk(file: BinaryIO, start: int, found: _Channels) -> Iterator[tuple[Topic,
         if kind in (DATA_END, FOOTER):
             return
         if kind == CHUNK:
-            inner = io.BytesIO(_unpack(data))
-            while inner.tell() < len(inner.getbuffer()):
+            records = _unpack(data)
+            inner = io.BytesIO(records)
+            while inner.tell() < len(records):
                 yield from _read_message(*_read_record(inner), found, offset)
         else:
             yield from _read_message(kind, data, found, offset)

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import yaml
 
 from torchcrf_scan.data.bag_records import Bag, Message, Topic
+from torchcrf_scan.data.bounded_yaml import read_yaml
+from torchcrf_scan.data.limits import MOST_CHUNK
 from torchcrf_scan.data.mcap_bag import MAGIC, McapBag
 
 if TYPE_CHECKING:
@@ -30,15 +32,18 @@ class SqliteBag:
     def _open(self) -> closing[sqlite3.Connection]:
         import sqlite3  # some Pythons have none
 
-        return closing(sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True))
+        base = sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+        base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_CHUNK)
+        return closing(base)
 
     def topics(self) -> list[Topic]:
         """The topics of the database. Raises ValueError if it cannot be read."""
         with self._open() as base:
             try:
+                _check_tables(base)
                 definitions = self._definitions(base)
-                rows = base.execute("SELECT name, type FROM topics ORDER BY id").fetchall()
-            except base.Error as error:
+                rows = base.execute("SELECT CAST(name AS TEXT), CAST(type AS TEXT) FROM topics ORDER BY id").fetchall()
+            except (base.Error, ValueError, AttributeError) as error:
                 raise ValueError(f"{self.path}: expected a database with topics, got {error}") from error
         return [Topic(name, kind, *definitions.get(kind, ("", False))) for name, kind in rows]
 
@@ -56,7 +61,8 @@ class SqliteBag:
             ValueError: a damaged or cut database, with the row, after all messages before it.
         """
         topics = {topic.name: topic for topic in self.topics()}
-        query = "SELECT messages.id, name, timestamp, data FROM messages JOIN topics ON topics.id = topic_id ORDER BY messages.id"
+        stored = "messages.id, CAST(name AS TEXT), CAST(timestamp AS INTEGER), CAST(data AS BLOB)"
+        query = f"SELECT {stored} FROM messages JOIN topics ON topics.id = topic_id ORDER BY messages.id"
         row = 0
         with self._open() as base:
             try:
@@ -65,6 +71,13 @@ class SqliteBag:
                         yield Message(topics[name], 1e-9 * stamp, data, f"{self.path}, row {row}")
             except base.Error as error:
                 raise ValueError(f"{self.path}, behind row {row}: expected a whole database, got {error}") from error
+
+
+def _check_tables(base: sqlite3.Connection) -> None:
+    """Raises ValueError for views and triggers: a bag has none, and they may compute for ever."""
+    found = base.execute("SELECT name FROM sqlite_master WHERE type NOT IN ('table', 'index')").fetchone()
+    if found:
+        raise ValueError(f"the view or trigger {found[0]!r}")
 
 
 class FolderBag:
@@ -101,9 +114,9 @@ def is_folder_bag(path: Path) -> bool:
 def _listed(path: Path) -> tuple[list[str], str]:
     """Files and kind of packing by the metadata of a folder."""
     try:
-        told = yaml.safe_load((path / METADATA).read_text())["rosbag2_bagfile_information"]
+        told = read_yaml(path / METADATA)["rosbag2_bagfile_information"]
         return [PurePath(name).name for name in told["relative_file_paths"]], (told.get("compression_mode") or "none").lower()
-    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
+    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path / METADATA}: expected a list of files, got {type(error).__name__}: {error}") from error
 
 
