@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import FARTHEST, LONGEST, Floats, Scan, ScanPair
 from torchcrf_scan.tree import tensor_tree
@@ -140,7 +141,7 @@ class ScanPairBatch:
             ValueError: no pairs, or a number that overflows the dtype or is beyond what a sensor gives.
         """
         if not pairs:
-            raise ValueError("pairs: expected at least one pair, got none")
+            raise TorchCRFScanError("pairs: expected at least one pair, got none")
         source, source_mask = _pad_points([pair.source for pair in pairs])
         target, target_mask = _pad_points([pair.target for pair in pairs])
         return cls(
@@ -164,7 +165,7 @@ def finite(name: str, values: Tensor, most: float = FARTHEST) -> Tensor:
     """The values, unchanged; raises ValueError if one is not finite, e.g. after overflow of a dtype, or beyond `most`."""
     wrong = values[~(values.double().abs() <= most)]  # half precision does not hold `most`
     if len(wrong):
-        raise ValueError(f"{name}: expected numbers of {values.dtype} within {most:g}, got {wrong[0].item()}")
+        raise TorchCRFScanError(f"{name}: expected numbers of {values.dtype} within {most:g}, got {wrong[0].item()}")
     return values
 
 
@@ -190,7 +191,9 @@ def initial_motion_of(pair: ScanPair) -> Floats:
         return np.zeros(3)
     guess = np.asarray(pair.initial_motion, dtype=np.float64)
     if guess.shape != (3,) or not (np.abs(guess) <= FARTHEST).all():
-        raise ValueError(f"initial_motion: expected three finite numbers (theta, tx, ty) within {FARTHEST:g}, got {guess.tolist()}")
+        raise TorchCRFScanError(
+            f"initial_motion: expected three finite numbers (theta, tx, ty) within {FARTHEST:g}, got {guess.tolist()}"
+        )
     return guess
 
 

@@ -16,6 +16,8 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
+
 Settings = TypeVar("Settings")
 
 UNIONS = (Union, UnionType)
@@ -99,11 +101,11 @@ def from_values(kind: Callable[..., Settings], values: object, name: str) -> Set
         ValueError: not a dictionary, an unknown setting, or a value rejected by `check_fields`.
     """
     if not isinstance(values, Mapping):
-        raise ValueError(f"{name}: expected settings by name, got {_shown(values)}")
+        raise TorchCRFScanError(f"{name}: expected settings by name, got {_shown(values)}")
     hints = _annotations(kind)
     unknown = [str(key) for key in values if key not in hints]
     if unknown:
-        raise ValueError(f"{name}: expected settings among {', '.join(hints)}, got {_shown(', '.join(unknown))}")
+        raise TorchCRFScanError(f"{name}: expected settings among {', '.join(hints)}, got {_shown(', '.join(unknown))}")
     return kind(**{key: from_values(hints[key], of, key) if is_dataclass(hints[key]) else of for key, of in values.items()})
 
 
@@ -118,7 +120,7 @@ def _converted(name: str, hint: Any, value: Any) -> Any:
     """The value converted to its annotated type."""
     base, bounds = (hint.__origin__, hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
     if not _suits(base, value):
-        raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
+        raise TorchCRFScanError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
     if get_origin(base) in UNIONS:
         base = next(of for of in get_args(base) if _suits(of, value))
     if get_origin(base) is tuple:
@@ -126,7 +128,7 @@ def _converted(name: str, hint: Any, value: Any) -> Any:
     else:
         converted = base(value) if base in (bool, int, float) else value
     if converted is not None and not all(bound.allows(converted) for bound in bounds):
-        raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
+        raise TorchCRFScanError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
     return converted
 
 

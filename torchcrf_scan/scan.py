@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchcrf_scan.beams import FARTHEST, Bools, Floats, Ints, bearings_of, check_sensor, times_of, vector
+from torchcrf_scan.errors import TorchCRFScanError
 
 BACKGROUND = 0
 OUTLIER = -1
@@ -173,7 +174,7 @@ class ScanPair:
 
     def __post_init__(self) -> None:
         if not SHORTEST <= self.dt <= LONGEST:
-            raise ValueError(f"dt: expected seconds between {SHORTEST:g} and {LONGEST:g}, got {self.dt}")
+            raise TorchCRFScanError(f"dt: expected seconds between {SHORTEST:g} and {LONGEST:g}, got {self.dt}")
 
 
 @dataclass(frozen=True, slots=True)

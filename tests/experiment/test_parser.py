@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jsonargparse import ArgumentError
 
-from torchcrf_scan.experiment.parser import DEEPEST, MOST_VALUES, check_size, config_of, load_yaml, settings_parser
+from torchcrf_scan.data.bounded_yaml import DEEPEST, MOST_VALUES, check_size
+from torchcrf_scan.experiment.parser import config_of, load_yaml, settings_parser
 from torchcrf_scan.experiment.settings import RunConfig
 
 

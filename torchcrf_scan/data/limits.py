@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torchcrf_scan.beams import MOST_BEAMS
+from torchcrf_scan.errors import TorchCRFScanError
 
 MOST_LINE = 1 << 22  # bytes of a line of text, more than that many beams of CARMEN's longest kind fill
 MOST_SILENCE = 1 << 26  # bytes of text without a scan
@@ -14,4 +15,4 @@ MOST_ARCHIVE = 1 << 26  # bytes of the archive, whose directory is read whole
 def check_beams(count: int, where: str) -> None:
     """Raises ValueError for more beams than `MOST_BEAMS`; where: file and place."""
     if count > MOST_BEAMS:
-        raise ValueError(f"{where}: expected at most {MOST_BEAMS} beams, got {count}")
+        raise TorchCRFScanError(f"{where}: expected at most {MOST_BEAMS} beams, got {count}")

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torchcrf_scan.data.archive import read_arrays
 from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
 from torchcrf_scan.data.reading import Reading
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, Scan, ScanPair, check_sensor
 from torchcrf_scan.whole_file import whole_file
 
@@ -52,7 +53,7 @@ class _Fields:
         return key in self.arrays
 
     def fail(self, key: str, expected: str, got: object) -> NoReturn:
-        raise ValueError(f"{self.path}: {key}: expected {expected}, got {got}")
+        raise TorchCRFScanError(f"{self.path}: {key}: expected {expected}, got {got}")
 
     def get(self, key: str, kind: str, *shape: int | str) -> NDArray[Any]:
         """The array `key` of a given kind of number and shape (a name fits any length), converted to the package's dtype."""
@@ -166,7 +167,7 @@ def _parse_pair(fields: _Fields) -> ScanPair:
     try:
         return ScanPair(source, target, dt, annotation, sequence, fields.path.stem, origin)
     except ValueError as error:
-        raise ValueError(f"{fields.path}: {error}") from error
+        raise TorchCRFScanError(f"{fields.path}: {error}") from error
 
 
 def _parse_sensor(fields: _Fields) -> dict[str, float | None]:
@@ -174,7 +175,7 @@ def _parse_sensor(fields: _Fields) -> dict[str, float | None]:
     try:
         check_sensor(**sensor)
     except ValueError as error:
-        raise ValueError(f"{fields.path}: {error}") from error
+        raise TorchCRFScanError(f"{fields.path}: {error}") from error
     return sensor
 
 
@@ -186,7 +187,7 @@ def _parse_scan(fields: _Fields, side: str, sensor: dict[str, float | None]) -> 
     try:
         return Scan.from_ranges(ranges, bearings, **sensor)
     except ValueError as error:
-        raise ValueError(f"{fields.path}: {side}_{error}") from error
+        raise TorchCRFScanError(f"{fields.path}: {side}_{error}") from error
 
 
 def _parse_annotation(fields: _Fields, source: Scan, target: Scan) -> Annotation | None:
@@ -255,7 +256,7 @@ def _pair_arrays(path: Path, pair: ScanPair) -> dict[str, NDArray[Any]]:
     for key in _SENSOR_KEYS:
         value, other = getattr(pair.source, key), getattr(pair.target, key)
         if value != other:
-            raise ValueError(f"{path}: {key}: expected the same of both scans, got {value} and {other}")
+            raise TorchCRFScanError(f"{path}: {key}: expected the same of both scans, got {value} and {other}")
         if value is not None:
             arrays[key] = np.float64(value)
     arrays |= {key: text for key, text in (("sequence", pair.sequence), ("source", pair.origin)) if text}

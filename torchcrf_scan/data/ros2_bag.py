@@ -14,6 +14,7 @@ from torchcrf_scan.data.bag_records import Bag, Message, Topic
 from torchcrf_scan.data.bounded_yaml import read_yaml
 from torchcrf_scan.data.limits import MOST_CHUNK
 from torchcrf_scan.data.mcap_bag import MAGIC, McapBag
+from torchcrf_scan.errors import TorchCRFScanError
 
 if TYPE_CHECKING:
     import sqlite3
@@ -42,9 +43,10 @@ class SqliteBag:
             try:
                 _check_tables(base)
                 definitions = self._definitions(base)
-                rows = base.execute("SELECT CAST(name AS TEXT), CAST(type AS TEXT) FROM topics ORDER BY id").fetchall()
+                known = "SELECT CAST(name AS TEXT), CAST(type AS TEXT) FROM topics WHERE name NOTNULL AND type NOTNULL ORDER BY id"
+                rows = base.execute(known).fetchall()
             except (base.Error, ValueError, AttributeError) as error:
-                raise ValueError(f"{self.path}: expected a database with topics, got {error}") from error
+                raise TorchCRFScanError(f"{self.path}: expected a database with topics, got {error}") from error
         return [Topic(name, kind, *definitions.get(kind, ("", False))) for name, kind in rows]
 
     def _definitions(self, base: sqlite3.Connection) -> dict[str, tuple[str, bool]]:
@@ -69,15 +71,15 @@ class SqliteBag:
                 for row, name, stamp, data in base.execute(query):
                     if name in names:
                         yield Message(topics[name], 1e-9 * stamp, data, f"{self.path}, row {row}")
-            except base.Error as error:
-                raise ValueError(f"{self.path}, behind row {row}: expected a whole database, got {error}") from error
+            except (base.Error, TypeError) as error:
+                raise TorchCRFScanError(f"{self.path}, behind row {row}: expected a whole database, got {error}") from error
 
 
 def _check_tables(base: sqlite3.Connection) -> None:
     """Raises ValueError for views and triggers: a bag has none, and they may compute for ever."""
     found = base.execute("SELECT name FROM sqlite_master WHERE type NOT IN ('table', 'index')").fetchone()
     if found:
-        raise ValueError(f"the view or trigger {found[0]!r}")
+        raise TorchCRFScanError(f"the view or trigger {found[0]!r}")
 
 
 class FolderBag:
@@ -91,7 +93,7 @@ class FolderBag:
         self.path = path
         names, mode = _listed(path) if (path / METADATA).is_file() else (sorted(file.name for file in _bags_in(path)), "none")
         if mode not in ("none", "", "message"):
-            raise ValueError(f"{path}: expected messages packed one by one or not at all, got files packed by {mode}")
+            raise TorchCRFScanError(f"{path}: expected messages packed one by one or not at all, got files packed by {mode}")
         self._is_packed = mode == "message"
         self._parts = [_part(path / name) for name in names]
 
@@ -117,7 +119,7 @@ def _listed(path: Path) -> tuple[list[str], str]:
         told = read_yaml(path / METADATA)["rosbag2_bagfile_information"]
         return [PurePath(name).name for name in told["relative_file_paths"]], (told.get("compression_mode") or "none").lower()
     except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{path / METADATA}: expected a list of files, got {type(error).__name__}: {error}") from error
+        raise TorchCRFScanError(f"{path / METADATA}: expected a list of files, got {type(error).__name__}: {error}") from error
 
 
 def _bags_in(path: Path) -> Iterator[Path]:
@@ -129,9 +131,9 @@ def _part(path: Path) -> Bag:
         with open(path, "rb") as file:
             head = file.read(len(SQLITE))
     except OSError as error:
-        raise ValueError(f"{path}: expected the file that {METADATA} lists, got {error}") from error
+        raise TorchCRFScanError(f"{path}: expected the file that {METADATA} lists, got {error}") from error
     if head.startswith(MAGIC):
         return McapBag(path)
     if head == SQLITE:
         return SqliteBag(path)
-    raise ValueError(f"{path}: expected a database of SQLite or MCAP, got another format")
+    raise TorchCRFScanError(f"{path}: expected a database of SQLite or MCAP, got another format")

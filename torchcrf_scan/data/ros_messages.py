@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchcrf_scan.data.limits import check_beams
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import Floats, Scan
 
 LASER, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
@@ -57,7 +58,7 @@ def cloud_scan(message: Any, no_return: float) -> Scan:
     points = _points(message)
     names = points.dtype.names or ()
     if not {"x", "y"} <= set(names):
-        raise ValueError(f"expected a cloud with x and y, got {', '.join(names)}")
+        raise TorchCRFScanError(f"expected a cloud with x and y, got {', '.join(names)}")
     x, y = (points[name].astype(np.float64) for name in ("x", "y"))
     with np.errstate(invalid="ignore"):
         ranges = np.hypot(x, y)
@@ -66,7 +67,7 @@ def cloud_scan(message: Any, no_return: float) -> Scan:
         height = points["z"][seen]
         far = np.abs(height - np.median(height)) > PLANAR
         if far.mean() > OUTLYING:
-            raise ValueError(f"expected a planar cloud, got heights from {height.min():.2f} to {height.max():.2f} m")
+            raise TorchCRFScanError(f"expected a planar cloud, got heights from {height.min():.2f} to {height.max():.2f} m")
     bearings = np.where(seen, np.arctan2(y, x), 0.0)
     return Scan.from_ranges(np.where(ranges < no_return, ranges, np.nan), bearings, times=_times(points))
 

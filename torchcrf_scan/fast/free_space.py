@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.features.free_space import SLACK_SHARE, SLACK_STEPS, WIDEST_GAP
+from torchcrf_scan.features.free_space import LEAST_STEP, SLACK_SHARE, SLACK_STEPS, WIDEST_GAP
 from torchcrf_scan.loops.circle import first_from, polar, rising_bearing, rising_turn, turn_between
 from torchcrf_scan.loops.jit import Array, kernel
 from torchcrf_scan.loops.median import lower_median
@@ -39,7 +39,8 @@ def sweep_of(points: Array, noise: float, is_closed: bool, origin: Array) -> Swe
     turns = np.empty(max(len(points) - 1, 0))
     for i in range(len(turns)):
         turns[i] = rising_turn(bearings[i + 1] - bearings[i])
-    return Sweep(origin, ranges, bearings, lower_median(turns) if len(turns) > 0 else USUAL_STEP, noise, is_closed)
+    step = max(lower_median(turns), LEAST_STEP) if len(turns) > 0 else USUAL_STEP
+    return Sweep(origin, ranges, bearings, step, noise, is_closed)
 
 
 @kernel

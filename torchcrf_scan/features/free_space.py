@@ -16,6 +16,7 @@ from torch.nn.functional import pad
 SLACK_STEPS = 3.0  # tolerance on a range, in beam spacings and noises,
 SLACK_SHARE = 0.02  # and as a share of the range: calibration, tilt
 BACKWARDS = 1e-4  # radians; smaller steps back are rounding errors
+LEAST_STEP = 1e-6  # radians between beams, below those of any sensor: returns may lie in one direction
 WIDEST_GAP = 2.5  # beam steps; between returns farther apart the scan holds no information
 
 
@@ -49,7 +50,7 @@ class Sweep:
         first = torch.atan2(arms[:, :1, 1], arms[:, :1, 0])
         bearings = torch.cat([first, first + turns.cumsum(1)], dim=1).masked_fill(~mask, torch.inf)
         known = pad(turns.masked_fill(~mask[:, 1:], torch.nan), (0, 1), value=torch.nan)  # a single point has no step
-        step = known.nanmedian(1).values.nan_to_num(nan=math.radians(0.5))
+        step = known.nanmedian(1).values.nan_to_num(nan=math.radians(0.5)).clamp(min=LEAST_STEP)
         return cls(origin, ranges, bearings, count, closed, step, noise)
 
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import rightness
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.inference.uncertainty import WITHIN
@@ -69,9 +70,9 @@ def calibrate_on(
         ValueError: fewer than two pairs, one without annotation, or a model of one chain.
     """
     if len(pairs) < 2 or any(pair.annotation is None for pair in pairs):
-        raise ValueError(f"pairs: expected two or more annotated pairs, got {len(pairs)}, or one without annotation")
+        raise TorchCRFScanError(f"pairs: expected two or more annotated pairs, got {len(pairs)}, or one without annotation")
     if not (model.config.has_association and model.config.has_clusters):
-        raise ValueError(f"chains: expected joint for a model to calibrate, got {model.config.chains}")
+        raise TorchCRFScanError(f"chains: expected joint for a model to calibrate, got {model.config.chains}")
     folds = folds_of(pairs)
     found = []
     if learning is not None:

@@ -25,6 +25,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.dataset import PairFiles, split_by_sequence
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import NAMED_WORLDS
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.metrics import PairScore, score_pairs
 from torchcrf_scan.evaluation.report import report
 from torchcrf_scan.evaluation.summary import summarise
@@ -171,7 +172,7 @@ def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], lis
     try:
         return split_by_sequence(pairs, config.gradient.validation, config.gradient.seed)
     except ValueError as error:
-        raise ValueError(f"gradient.validation: {error}") from error
+        raise TorchCRFScanError(f"gradient.validation: {error}") from error
 
 
 def prepare(
@@ -218,7 +219,7 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
 def load_data(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
     """Training and test pairs: files, then simulated worlds."""
     if not config.train and not config.simulate_train:
-        raise ValueError("data.simulate_train: expected a world at least where data.train names no files, got none")
+        raise TorchCRFScanError("data.simulate_train: expected a world at least where data.train names no files, got none")
 
     def load(patterns: tuple[str, ...] | str, worlds: tuple[str, ...], seed: int) -> list[ScanPair]:
         patterns = (patterns,) if isinstance(patterns, str) else patterns
