@@ -77,6 +77,12 @@ def test_a_file_that_is_no_settings_is_refused(text: str, message: str, tmp_path
         parse(f"--config={tmp_path / 'file.yaml'}")
 
 
+def test_a_file_of_other_bytes_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file.yaml").write_bytes(b"data: \xff\n")
+    with pytest.raises(ArgumentError, match="expected a text, got 'utf-8' codec can't decode byte 0xff"):
+        parse(f"--config={tmp_path / 'file.yaml'}")
+
+
 def test_aliases_within_bounds_are_read() -> None:
     assert load_yaml("a: &a [1, 2]\nb: [*a, *a]") == {"a": [1, 2], "b": [[1, 2], [1, 2]]}
     check_size(laughs(4))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import NoReturn
 
-from jsonargparse import ArgumentParser
+from torchcrf_scan.experiment.parser import SettingsParser
 
 ALIKE = 60.0  # of 100, the least likeness of an option that may have been meant
 UNKNOWN = "unrecognized arguments: "
 
 
-class CommandParser(ArgumentParser):
-    """An `ArgumentParser` that suggests options."""
+class CommandParser(SettingsParser):
+    """A parser that suggests options."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Ends with a usage error; an unknown option is told with the nearest right one of the command."""

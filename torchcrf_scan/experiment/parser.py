@@ -13,7 +13,18 @@ from torchcrf_scan.data.bounded_yaml import check_size
 from torchcrf_scan.experiment.settings import RunConfig
 
 
-def settings_parser(kind: type[ArgumentParser] = ArgumentParser, **options: Any) -> ArgumentParser:
+class SettingsParser(ArgumentParser):
+    """An `ArgumentParser` that refuses a file of other bytes than text as it refuses other settings."""
+
+    def parse_path(self, path: str, *args: Any, **options: Any) -> Any:
+        """The settings of a file."""
+        try:
+            return super().parse_path(path, *args, **options)
+        except UnicodeDecodeError as error:
+            raise TypeError(f"{path}: expected a text, got {error}") from error
+
+
+def settings_parser(kind: type[ArgumentParser] = SettingsParser, **options: Any) -> ArgumentParser:
     """A parser of the fields of `RunConfig`, from YAML files (`--config`) and one by one. options: of `ArgumentParser`."""
     _bound_yaml()
     parser = kind(**options)
