@@ -15,6 +15,7 @@ import shutil
 import sys
 import time
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -121,8 +122,8 @@ def _other_array(array: np.ndarray, random: Random) -> bytes:
 
 
 def unpacked_first(mutate: Callable[[bytes, Random], bytes]) -> Callable[[bytes, Random], bytes]:
-    """The mutation of what a gzipped file holds, packed again."""
-    return lambda data, random: gzip.compress(mutate(gzip.decompress(data), random), 1)
+    """The mutation of what a gzipped file holds, also a cut one, packed again."""
+    return lambda data, random: gzip.compress(mutate(zlib.decompressobj(31).decompress(data), random), 1)
 
 
 # --- uses: each raises TorchCRFScanError for a file that it refuses, and nothing else ------------------------------------------
@@ -246,12 +247,12 @@ def assert_all(values: np.ndarray) -> None:
 
 
 def recorded_targets(recordings: Path, configs: Path) -> list[Target]:
-    """Of the pairs and logs of a folder; of long logs the beginning."""
+    """Of the pairs and logs of a folder; of long logs the beginning, a chunk or two of a bag."""
     pairs = sorted((recordings / "pairs").glob("*.npz"))[::10]
     found = [target for path in pairs for target in pair_targets(path.name, path.read_bytes())]
     for path in sorted((recordings / "logs").iterdir()):
         with path.open("rb") as file:
-            found += log_targets(path.name, file.read(200_000))
+            found += log_targets(path.name, file.read(2_000_000 if path.suffix == ".bag" else 200_000))
     return [*found, *other_targets(read_pair(pairs[0]), configs)]
 
 
