@@ -339,11 +339,17 @@ def test_a_guess_of_the_motion_comes_along() -> None:
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
 def test_numbers_that_a_dtype_does_not_hold_are_refused(dtype: torch.dtype) -> None:
     beyond = 2.0 * torch.finfo(dtype).max
-    far = Scan(np.array([beyond]), np.zeros(1), np.arange(1), 1)
-    near = Scan.from_ranges([1.0], [0.0])
-    for side, pair in (("source", ScanPair(far, near)), ("target", ScanPair(near, far)), ("dt", ScanPair(near, near, dt=beyond))):
-        with pytest.raises(ValueError, match=f"^{side}: expected finite numbers of {dtype}, got inf$"):
-            ScanPairBatch.collate([pair], dtype)
-        with pytest.raises(ValueError, match=f"^{side}: expected finite numbers of {dtype}, got inf$"):
-            pair_of_scans(pair, dtype)
-    assert len(ScanPairBatch.collate([ScanPair(far, far)], torch.float64)) == 1
+    near, far = Scan.from_ranges([1.0], [0.0]), Scan(np.array([beyond]), np.zeros(1), np.arange(1), 1)
+    for side, pair in (("source", ScanPair(far, near)), ("target", ScanPair(near, far))):
+        for make in (lambda pair: ScanPairBatch.collate([pair], dtype), lambda pair: pair_of_scans(pair, dtype)):
+            with pytest.raises(ValueError, match=rf"^{side}: expected numbers of {dtype} within 1e\+06, got inf$"):
+                make(pair)
+    with pytest.raises(ValueError, match=r"^dt: expected numbers of torch.float16 within 1e\+09, got inf$"):
+        ScanPairBatch.collate([ScanPair(near, near, dt=1e6)], torch.float16)
+
+
+def test_a_scan_made_by_hand_is_no_farther_than_one_that_was_read() -> None:
+    near, far = Scan.from_ranges([1.0], [0.0]), Scan(np.array([1e20]), np.zeros(1), np.arange(1), 1)
+    for make in (lambda pair: ScanPairBatch.collate([pair]), lambda pair: pair_of_scans(pair, torch.float64)):
+        with pytest.raises(ValueError, match=r"^target: expected numbers of torch.float\d\d within 1e\+06, got 1"):
+            make(ScanPair(near, far))

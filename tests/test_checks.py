@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchcrf_scan.checks import Amount, OneOf, Positive, Share, Within, check_fields, from_values
+from torchcrf_scan.checks import Amount, AtMost, OneOf, Positive, Share, Within, check_fields, from_values
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Outer:
     is_on: bool = False
     kind: Annotated[str, OneOf("one", "other")] = "one"
     names: tuple[Annotated[str, OneOf("a", "b")], ...] = ()
-    sizes: tuple[Annotated[int, Within(1)], ...] = (1,)
+    sizes: Annotated[tuple[Annotated[int, Within(1)], ...], AtMost(3)] = (1,)
     files: tuple[str, ...] | str = ()
     maybe: float | None = None
     inner: Inner = field(default_factory=Inner)
@@ -74,6 +74,8 @@ def refusal(**values: Any) -> str:
         ("names", ["a", "c"], "one of a, b, got c"),
         ("names", None, "a list, got None"),
         ("sizes", [1, 0], "a whole number, 1 or more, got 0"),
+        ("sizes", [1, 1, 1, 1], "a list of at most 3, got [1, 1, 1, 1]"),
+        ("sizes", 1, "a list of at most 3, got 1"),
         ("files", 3, "a list or a text, got 3"),
         ("files", ["a", 3], "a text, got 3"),
         ("maybe", "x", "a finite number or nothing, got x"),

@@ -13,7 +13,7 @@ import torch
 from safetensors.numpy import load_file, save_file
 from support import normal
 
-from torchcrf_scan import InferenceConfig, JointScanCRF, MatchingCRF, ModelConfig
+from torchcrf_scan import InferenceConfig, JointScanCRF, MatchingCRF, ModelConfig, pretrained
 from torchcrf_scan.config import RUN_TIME, EncoderConfig, FeatureConfig
 from torchcrf_scan.pretrained import CONFIG, WEIGHTS, find_weights, model_config, read_config
 
@@ -164,6 +164,10 @@ def test_the_shipped_models_are_of_this_time(name: str) -> None:
         ('{"features": {"left_out": "association.dist1"}}', "left_out: expected a list, got association.dist1"),
         ('{"features": null}', "features: expected settings by name, got None"),
         ('{"encoder": {"dilations": [0]}}', r"encoder.dilations: expected a whole number in \[1, 10000\], got 0"),
+        (
+            '{"encoder": {"dilations": [1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1]}}',
+            "encoder.dilations: expected a list of at most 16, got",
+        ),
         ('{"chains": ["joint"]}', r"chains: expected one of joint, matching, clustering, got \['joint'\]"),
     ],
 )
@@ -173,13 +177,13 @@ def test_a_config_that_is_none_is_a_value_error_with_its_file(text: str, message
         JointScanCRF.from_pretrained(saved)
 
 
-@pytest.mark.parametrize(("part", "value"), [("sequence", np.nan), ("sequence", np.inf), ("thresholds", np.nan)])
+@pytest.mark.parametrize(("part", "value"), [("sequence", np.nan), ("sequence", np.inf), ("sequence", 2e4), ("thresholds", np.nan)])
 def test_weights_that_are_no_numbers_are_refused(part: str, value: float, saved: Path) -> None:
     tensors = load_file(saved / WEIGHTS)
     name = next(name for name in sorted(tensors) if name.endswith(part))
     tensors[name] = np.full_like(tensors[name], value)
     save_file(tensors, saved / WEIGHTS)
-    with pytest.raises(ValueError, match=f"{WEIGHTS}: {name}: expected finite numbers, got {value}"):
+    with pytest.raises(ValueError, match=f"{WEIGHTS}: {name}: expected finite numbers within 10000, got {value}"):
         JointScanCRF.from_pretrained(saved)
 
 
@@ -189,6 +193,13 @@ def test_weights_that_are_none_are_refused(content: bytes | None, saved: Path) -
     (saved / WEIGHTS).write_bytes(whole[: len(whole) // 2] if content is None else content)
     with pytest.raises(ValueError, match=f"^{saved / WEIGHTS}: expected the tensors of the model"):
         JointScanCRF.from_pretrained(saved)
+
+
+def test_files_longer_than_a_models_are_not_read(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, limit in ((WEIGHTS, "MOST_WEIGHTS"), (CONFIG, "MOST_CONFIG")):
+        monkeypatch.setattr(pretrained, limit, 100)
+        with pytest.raises(ValueError, match=f"{saved / name}: expected at most 100 bytes, got more"):
+            JointScanCRF.from_pretrained(saved)
 
 
 def test_weights_of_another_model_are_refused(saved: Path) -> None:

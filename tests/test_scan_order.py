@@ -1,5 +1,7 @@
 """Beams in any order and direction: the answer of the sorted scan, in the numbering given."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -107,7 +109,7 @@ def test_a_masked_beam_is_no_return(dtype: type) -> None:
     assert Scan.from_ranges(np.ma.MaskedArray([1.0, 2.0]), [0.0, 0.1]).beam.tolist() == [0, 1]
 
 
-@given(arrays.arrays(np.float64, 6, elements=st.floats(-1e9, 1e9)))
+@given(arrays.arrays(np.float64, 6, elements=st.floats(-4e5, 4e5)))
 def test_times_count_from_the_first_beam_given(times: np.ndarray) -> None:
     scan = Scan.from_ranges([1.0, np.nan, 1.0, 1.0, 0.0, 1.0], [0.5, 0.4, 0.3, 0.2, 0.1, 0.0], times=times)
     assert scan.beam.tolist() == [5, 3, 2, 0]
@@ -123,8 +125,10 @@ def test_times_are_unknown_without_an_increment() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"time_increment": np.nan}, "time_increment: expected a finite number of seconds, got nan"),
-        ({"times": [0.0, np.inf]}, "times: expected finite numbers, got 1 that are not"),
+        ({"time_increment": np.nan}, r"time_increment: expected seconds within 1e\+06 of the first beam's, got nan"),
+        ({"time_increment": 1e308}, r"time_increment: expected seconds within 1e\+06 of the first beam's, got 1e\+308"),
+        ({"times": [0.0, np.inf]}, r"times: expected seconds within 1e\+06 of the first beam's, got inf"),
+        ({"times": [-1e308, 1e308]}, r"times: expected seconds within 1e\+06 of the first beam's, got inf"),
         ({"times": [0.0]}, r"times: expected shape \(2,\), got \(1,\)"),
         ({"times": [0.0, 0.1], "time_increment": 0.1}, "times: expected either times or time_increment, got both"),
     ],
@@ -134,10 +138,10 @@ def test_wrong_times_are_named(wrong: dict, message: str) -> None:
         Scan.from_ranges([1.0, 2.0], [0.0, 0.1], **wrong)
 
 
-@pytest.mark.parametrize("dt", [0.0, -0.1, np.nan, np.inf])
+@pytest.mark.parametrize("dt", [0.0, -0.1, 5e-324, 1e-7, 1e10, np.nan, np.inf])
 def test_scans_without_time_between_them_make_no_pair(dt: float) -> None:
     scan = Scan.from_ranges([1.0], [0.0])
-    with pytest.raises(ValueError, match=f"^dt: expected a finite number of seconds above 0, got {dt}$"):
+    with pytest.raises(ValueError, match=rf"^dt: expected seconds between 1e-06 and 1e\+09, got {re.escape(str(dt))}$"):
         ScanPair(scan, scan, dt)
     with pytest.raises(ValueError, match=r"^dt: expected"):
         MODEL.match(scan, scan, dt=dt)

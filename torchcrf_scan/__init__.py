@@ -8,6 +8,7 @@ are bool, True = real; log-domain quantities are named `log_*`. Frame: x ahead, 
 
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import FeatureConfig, InferenceConfig, ModelConfig
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.features.learned import ExtraLogUnary
 from torchcrf_scan.model import ClusteringCRF, JointScanCRF, MatchingCRF
 from torchcrf_scan.prediction import Prediction
@@ -36,5 +37,6 @@ __all__ = [
     "ScanResult",
     "ScanStream",
     "StreamConfig",
+    "TorchCRFScanError",
     "__version__",
 ]

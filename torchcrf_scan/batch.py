@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
-from torchcrf_scan.scan import FARTHEST, Floats, Scan, ScanPair
+from torchcrf_scan.scan import FARTHEST, LONGEST, Floats, Scan, ScanPair
 from torchcrf_scan.tree import tensor_tree
 
 
@@ -137,10 +138,10 @@ class ScanPairBatch:
         """Pads pairs into one batch, each scan to at least one (masked) point; `truth` is set if every pair is annotated.
 
         Raises:
-            ValueError: no pairs, or a number that overflows the dtype.
+            ValueError: no pairs, or a number that overflows the dtype or is beyond what a sensor gives.
         """
         if not pairs:
-            raise ValueError("pairs: expected at least one pair, got none")
+            raise TorchCRFScanError("pairs: expected at least one pair, got none")
         source, source_mask = _pad_points([pair.source for pair in pairs])
         target, target_mask = _pad_points([pair.target for pair in pairs])
         return cls(
@@ -150,7 +151,7 @@ class ScanPairBatch:
             target_mask=target_mask,
             source_closed=torch.tensor([pair.source.is_closed for pair in pairs]),
             target_closed=torch.tensor([pair.target.is_closed for pair in pairs]),
-            dt=finite("dt", torch.tensor([pair.dt for pair in pairs], dtype=dtype)),
+            dt=finite("dt", torch.tensor([pair.dt for pair in pairs], dtype=dtype), LONGEST),
             range_noise=finite("range_noise", torch.tensor([range_noise_of(pair) for pair in pairs], dtype=dtype)),
             initial_motion=finite(
                 "initial_motion", torch.from_numpy(np.stack([initial_motion_of(pair) for pair in pairs])).to(dtype)
@@ -160,11 +161,11 @@ class ScanPairBatch:
         )
 
 
-def finite(name: str, values: Tensor) -> Tensor:
-    """The values, unchanged; raises ValueError if one is not finite, e.g. after overflow of a dtype."""
-    wrong = values[~torch.isfinite(values)]
+def finite(name: str, values: Tensor, most: float = FARTHEST) -> Tensor:
+    """The values, unchanged; raises ValueError if one is not finite, e.g. after overflow of a dtype, or beyond `most`."""
+    wrong = values[~(values.double().abs() <= most)]  # half precision does not hold `most`
     if len(wrong):
-        raise ValueError(f"{name}: expected finite numbers of {values.dtype}, got {wrong[0].item()}")
+        raise TorchCRFScanError(f"{name}: expected numbers of {values.dtype} within {most:g}, got {wrong[0].item()}")
     return values
 
 
@@ -190,7 +191,9 @@ def initial_motion_of(pair: ScanPair) -> Floats:
         return np.zeros(3)
     guess = np.asarray(pair.initial_motion, dtype=np.float64)
     if guess.shape != (3,) or not (np.abs(guess) <= FARTHEST).all():
-        raise ValueError(f"initial_motion: expected three finite numbers (theta, tx, ty) within {FARTHEST:g}, got {guess.tolist()}")
+        raise TorchCRFScanError(
+            f"initial_motion: expected three finite numbers (theta, tx, ty) within {FARTHEST:g}, got {guess.tolist()}"
+        )
     return guess
 
 

@@ -5,22 +5,37 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torchcrf_scan.errors import TorchCRFScanError
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+NUMBERS = "biufO"  # kinds of arrays that are converted; objects one by one
+
 FARTHEST = 1e6  # metres; larger ranges are treated as invalid, as their squares would lose single precision
+FARTHEST_BEARING = 4 * np.pi  # radians; a sensor's own numbers stay within two turns
+LONGEST_SWEEP = 1e6  # seconds between the first beam and any other
+MOST_BEAMS = 20_000  # of a scan, above what sensors give; a pair of so many takes minutes
 WIDEST_SPAN = 1.05 * 2 * np.pi  # radians; a turn and a step of a coarse scan. What spans more is in degrees
 
 
 def vector(name: str, values: ArrayLike, length: int | None = None) -> Floats:
     """(length,) numbers, NaN where the array is masked."""
-    if isinstance(values, np.ma.MaskedArray):
-        values = np.ma.filled(values.astype(np.float64), np.nan)
-    array = np.asarray(values, dtype=np.float64)
+    try:
+        if isinstance(values, np.ma.MaskedArray):
+            values = np.ma.filled(values.astype(np.float64), np.nan)
+        array = np.asarray(values)
+        if array.dtype.kind not in NUMBERS:
+            raise TypeError(array.dtype)
+        array = array.astype(np.float64, copy=False)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise TorchCRFScanError(f"{name}: expected numbers, got {error}") from error
     if array.ndim != 1 or (length is not None and len(array) != length):
         expected = "(N,)" if length is None else f"({length},)"
-        raise ValueError(f"{name}: expected shape {expected}, got {array.shape}")
+        raise TorchCRFScanError(f"{name}: expected shape {expected}, got {array.shape}")
+    if len(array) > MOST_BEAMS:
+        raise TorchCRFScanError(f"{name}: expected at most {MOST_BEAMS} beams, got {len(array)}")
     return array
 
 
@@ -28,42 +43,50 @@ def check_sensor(range_min: float | None, range_max: float | None, range_noise: 
     """Raises ValueError for impossible sensor limits: not a number, an empty interval, or noise out of bounds."""
     least = 0.0 if range_min is None else range_min
     if not np.isfinite(least):
-        raise ValueError(f"range_min: expected a finite number of metres, got {range_min}")
+        raise TorchCRFScanError(f"range_min: expected a finite number of metres, got {range_min}")
     if range_max is not None and not range_max > max(least, 0.0):
-        raise ValueError(f"range_max: expected more than range_min = {max(least, 0.0)}, got {range_max}")
+        raise TorchCRFScanError(f"range_max: expected more than range_min = {max(least, 0.0)}, got {range_max}")
     if range_noise is not None and not 0 <= range_noise <= FARTHEST:
-        raise ValueError(f"range_noise: expected metres between 0 and {FARTHEST:g}, got {range_noise}")
+        raise TorchCRFScanError(f"range_noise: expected metres between 0 and {FARTHEST:g}, got {range_noise}")
 
 
 def bearings_of(count: int, bearings: ArrayLike | None, angle_min: float | None, angle_increment: float | None) -> Floats:
     """(count,) bearings from either form, checked."""
     steps = [value for value in (angle_min, angle_increment) if value is not None]
     if len(steps) != (2 if bearings is None else 0):
-        raise ValueError("bearings: expected either bearings or both angle_min and angle_increment, got neither, half or both")
+        raise TorchCRFScanError(
+            "bearings: expected either bearings or both angle_min and angle_increment, got neither, half or both"
+        )
     if bearings is None:
         first, increment = steps
         if increment == 0 and count > 1:
-            raise ValueError("angle_increment: expected radians from beam to beam, got 0")
-        bearings = first + increment * np.arange(count)
+            raise TorchCRFScanError("angle_increment: expected radians from beam to beam, got 0")
+        with np.errstate(over="ignore", invalid="ignore"):
+            bearings = first + increment * np.arange(count)
     bearings = vector("bearings", bearings, count)
     if not np.isfinite(bearings).all():
-        raise ValueError(f"bearings: expected finite numbers, got {np.count_nonzero(~np.isfinite(bearings))} that are not")
-    if count > 0 and np.ptp(bearings) > WIDEST_SPAN:
-        raise ValueError(f"bearings: expected radians of one turn, got a span of {np.ptp(bearings):.1f}; are these degrees?")
+        raise TorchCRFScanError(f"bearings: expected finite numbers, got {np.count_nonzero(~np.isfinite(bearings))} that are not")
+    span = np.max(bearings, initial=-np.inf) - np.min(bearings, initial=np.inf)
+    if span > WIDEST_SPAN:
+        raise TorchCRFScanError(f"bearings: expected radians of one turn, got a span of {span:.1f}; are these degrees?")
+    if np.abs(bearings).max(initial=0.0) > FARTHEST_BEARING:
+        raise TorchCRFScanError(f"bearings: expected radians within two turns, got {bearings[np.abs(bearings).argmax()]:.6g}")
     return bearings
 
 
 def times_of(count: int, time_increment: float | None, times: ArrayLike | None) -> Floats | None:
     """(count,) seconds of the beams after the first one; None: unknown."""
     if time_increment is not None and times is not None:
-        raise ValueError("times: expected either times or time_increment, got both")
-    if times is not None:
-        after = vector("times", times, count)
-        if not np.isfinite(after).all():
-            raise ValueError(f"times: expected finite numbers, got {np.count_nonzero(~np.isfinite(after))} that are not")
-        return after - after[:1]
-    if not time_increment:
-        return None
-    if not np.isfinite(time_increment):
-        raise ValueError(f"time_increment: expected a finite number of seconds, got {time_increment}")
-    return time_increment * np.arange(count, dtype=np.float64)
+        raise TorchCRFScanError("times: expected either times or time_increment, got both")
+    with np.errstate(over="ignore", invalid="ignore"):
+        if times is not None:
+            name, after = "times", vector("times", times, count)
+        elif time_increment:
+            name, after = "time_increment", time_increment * np.arange(count, dtype=np.float64)
+        else:
+            return None
+        after = after - after[:1]
+    wrong = after[~(np.abs(after) <= LONGEST_SWEEP)]
+    if len(wrong):
+        raise TorchCRFScanError(f"{name}: expected seconds within {LONGEST_SWEEP:g} of the first beam's, got {wrong[0]:.6g}")
+    return after

@@ -7,7 +7,7 @@ checks all fields when the dataclass is constructed, whether from a command, a f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sized
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from numbers import Integral, Real
@@ -15,6 +15,8 @@ from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+
+from torchcrf_scan.errors import TorchCRFScanError
 
 Settings = TypeVar("Settings")
 
@@ -40,6 +42,20 @@ class Within:
         if self.most == math.inf:
             return f" above {self.least}" if self.above else f", {self.least} or more"
         return f" in {'(' if self.above else '['}{self.least}, {self.most}{')' if self.below else ']'}"
+
+
+@dataclass(frozen=True, slots=True)
+class AtMost:
+    """A list of limited length."""
+
+    count: int
+
+    def allows(self, value: Sized) -> bool:
+        """Whether a list is short enough."""
+        return len(value) <= self.count
+
+    def __str__(self) -> str:
+        return f" of at most {self.count}"
 
 
 class OneOf:
@@ -85,11 +101,11 @@ def from_values(kind: Callable[..., Settings], values: object, name: str) -> Set
         ValueError: not a dictionary, an unknown setting, or a value rejected by `check_fields`.
     """
     if not isinstance(values, Mapping):
-        raise ValueError(f"{name}: expected settings by name, got {_shown(values)}")
+        raise TorchCRFScanError(f"{name}: expected settings by name, got {_shown(values)}")
     hints = _annotations(kind)
     unknown = [str(key) for key in values if key not in hints]
     if unknown:
-        raise ValueError(f"{name}: expected settings among {', '.join(hints)}, got {_shown(', '.join(unknown))}")
+        raise TorchCRFScanError(f"{name}: expected settings among {', '.join(hints)}, got {_shown(', '.join(unknown))}")
     return kind(**{key: from_values(hints[key], of, key) if is_dataclass(hints[key]) else of for key, of in values.items()})
 
 
@@ -104,14 +120,15 @@ def _converted(name: str, hint: Any, value: Any) -> Any:
     """The value converted to its annotated type."""
     base, bounds = (hint.__origin__, hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
     if not _suits(base, value):
-        raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
+        raise TorchCRFScanError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
     if get_origin(base) in UNIONS:
         base = next(of for of in get_args(base) if _suits(of, value))
     if get_origin(base) is tuple:
-        return tuple(_converted(name, get_args(base)[0], of) for of in value)
-    converted = base(value) if base in (bool, int, float) else value
+        converted = tuple(_converted(name, get_args(base)[0], of) for of in value)
+    else:
+        converted = base(value) if base in (bool, int, float) else value
     if converted is not None and not all(bound.allows(converted) for bound in bounds):
-        raise ValueError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
+        raise TorchCRFScanError(f"{name}: expected {_description(hint)}, got {_shown(value)}")
     return converted
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
-from torchcrf_scan.checks import Amount, OneOf, Within, check_fields
+from torchcrf_scan.checks import Amount, AtMost, OneOf, Within, check_fields
 from torchcrf_scan.choices import (
     CANDIDATE_SEARCHES,
     CHAINS,
@@ -19,6 +19,7 @@ from torchcrf_scan.choices import (
     STARTS,
     with_ability,
 )
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.names import WEIGHTS
 
 LEFT_OUT = (
@@ -126,7 +127,7 @@ class FeatureConfig:
     def __post_init__(self) -> None:
         check_fields(self)
         if self.learn_stumps and self.smooth == 0:
-            raise ValueError("learn_stumps: expected smooth above 0 (steps have no gradient), got smooth 0")
+            raise TorchCRFScanError("learn_stumps: expected smooth above 0 (steps have no gradient), got smooth 0")
 
 
 @dataclass(frozen=True)
@@ -139,9 +140,9 @@ class EncoderConfig:
         embedding: channels of its embeddings, in addition to its log potentials; needs `features.embedding`; 0: none.
     """
 
-    width: Annotated[int, Within(0, 4096)] = 0
-    dilations: tuple[Annotated[int, Within(1, 10_000)], ...] = (1, 2, 4, 8, 16)
-    embedding: Annotated[int, Within(0, 4096)] = 0
+    width: Annotated[int, Within(0, 1024)] = 0
+    dilations: Annotated[tuple[Annotated[int, Within(1, 10_000)], ...], AtMost(16)] = (1, 2, 4, 8, 16)
+    embedding: Annotated[int, Within(0, 1024)] = 0
 
     def __post_init__(self) -> None:
         check_fields(self, "encoder.")
@@ -171,15 +172,15 @@ class ModelConfig:
         if self.encoder.width > 0:
             self.require("takes_extras", "for a model with an encoder")
         if self.encoder.embedding > 0 and self.features.embedding == "none":
-            raise ValueError("features.embedding: expected dot or cosine for an encoder that makes embeddings, got none")
+            raise TorchCRFScanError("features.embedding: expected dot or cosine for an encoder that makes embeddings, got none")
         schedule, is_one_chain = self.inference.schedule, bool(COUPLINGS[self.coupling].chain)
         two_chains = " or ".join(name for name, coupling in COUPLINGS.items() if not coupling.chain)
         if is_one_chain and not (self.has_association and self.has_clusters):
-            raise ValueError(f"coupling: expected {two_chains} for the {self.chains} chain alone, got {self.coupling}")
+            raise TorchCRFScanError(f"coupling: expected {two_chains} for the {self.chains} chain alone, got {self.coupling}")
         if self.inference.outlier_distance is not None:
             self.require("takes_limit", "with outlier_distance")
         if is_one_chain and not SCHEDULES[schedule].takes_couplings:
-            raise ValueError(f"coupling: expected {two_chains} with schedule {schedule}, got {self.coupling}")
+            raise TorchCRFScanError(f"coupling: expected {two_chains} with schedule {schedule}, got {self.coupling}")
 
     def with_limit(self, outlier_distance: float | None) -> ModelConfig:
         """The settings with this `outlier_distance`; None: the same. Raises ValueError for one that they do not take."""
@@ -210,4 +211,6 @@ class ModelConfig:
     def require(self, ability: str, purpose: str) -> None:
         """Raises ValueError if a variant lacks an ability that a purpose needs."""
         for name, value in self.without(ability).items():
-            raise ValueError(f"{name}: expected {' or '.join(with_ability(OF_ROUNDS[name], ability))} {purpose}, got {value}")
+            raise TorchCRFScanError(
+                f"{name}: expected {' or '.join(with_ability(OF_ROUNDS[name], ability))} {purpose}, got {value}"
+            )

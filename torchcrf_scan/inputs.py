@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.features.learned import ExtraLogUnary
 from torchcrf_scan.inference.pseudo_likelihood import PlugIns
 from torchcrf_scan.inference.start import Start
@@ -116,15 +117,15 @@ def check_tensor(
     wanted = tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in axes)
     is_alike = value.dim() == len(wanted) and all(isinstance(w, str) or w == n for w, n in zip(wanted, value.shape, strict=True))
     if not is_alike:
-        raise ValueError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
+        raise TorchCRFScanError(f"{name}: expected shape {wanted}, got {tuple(value.shape)}")
     device = like.device.type
     allowed = [like.dtype if dtype is None else dtype]
     if is_learned and _is_in_autocast(device):
         allowed.append(torch.get_autocast_dtype(device))
     if value.dtype not in allowed:
-        raise ValueError(f"{name}: expected dtype {' or '.join(map(str, allowed))}, got {value.dtype}")
+        raise TorchCRFScanError(f"{name}: expected dtype {' or '.join(map(str, allowed))}, got {value.dtype}")
     if value.device != like.device:
-        raise ValueError(f"{name}: expected device {like.device}, got {value.device}")
+        raise TorchCRFScanError(f"{name}: expected device {like.device}, got {value.device}")
 
 
 def full_precision(device: str) -> AbstractContextManager[object]:

@@ -17,6 +17,7 @@ from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.choices import STARTS
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.encoder.encoder import ScanEncoder
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
 from torchcrf_scan.fast.arrays import fitted_of, settings_of
 from torchcrf_scan.fast.choice import can_decode
@@ -164,7 +165,7 @@ class JointScanCRF(nn.Module):
         if encoded.source_embedding is None:
             return extra.plus(encoded.extra), embeddings
         if any(of is not None for of in embeddings):
-            raise ValueError("source_embedding: expected none for a model whose encoder makes embeddings, got one")
+            raise TorchCRFScanError("source_embedding: expected none for a model whose encoder makes embeddings, got one")
         return extra.plus(encoded.extra), (encoded.source_embedding, encoded.target_embedding)
 
     def _embeddings(self, batch: ScanPairBatch, source: Tensor | None, target: Tensor | None) -> Embeddings | None:
@@ -172,10 +173,10 @@ class JointScanCRF(nn.Module):
             return None
         kind = self.config.features.embedding
         if kind == "none":
-            raise ValueError("source_embedding: expected none for a model with features.embedding none, got one")
+            raise TorchCRFScanError("source_embedding: expected none for a model with features.embedding none, got one")
         if source is None or target is None or source.shape[2] != target.shape[2]:
             got = [None if of is None else tuple(of.shape) for of in (source, target)]
-            raise ValueError(f"target_embedding: expected both embeddings with the same C, got {got[0]} and {got[1]}")
+            raise TorchCRFScanError(f"target_embedding: expected both embeddings with the same C, got {got[0]} and {got[1]}")
         weights = self.association_weights["embedding"], self.association_weights["embedding_data"]
         return Embeddings.of(source, target, (batch.source_mask, batch.target_mask), kind, weights)
 
@@ -317,7 +318,7 @@ class JointScanCRF(nn.Module):
             ValueError: no annotation, or an input that does not fit as in `forward`.
         """
         if batch.truth is None:
-            raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
+            raise TorchCRFScanError("batch.truth: expected annotated pairs, got a batch without truth")
         if self.encoder is not None:
             start = start or self.initialise(batch)
         learned = self.learned_inputs(
@@ -392,7 +393,7 @@ class JointScanCRF(nn.Module):
         has_embeddings = config.encoder.embedding > 0
         if not (STARTS[config.start].in_loops and can_decode(config, reference.device, has_embeddings=has_embeddings)):
             if record is not None:
-                raise ValueError("trace: expected a model whose start and rounds the loops compute, on a CPU, got another")
+                raise TorchCRFScanError("trace: expected a model whose start and rounds the loops compute, on a CPU, got another")
             batch = ScanPairBatch.collate(pairs, reference.dtype).without_truth().to(reference.device)
             prediction = self(batch, outlier_distance=outlier_distance)
             return [prediction.pair(b, pair) for b, pair in enumerate(pairs)]

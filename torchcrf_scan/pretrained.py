@@ -15,11 +15,14 @@ from torch import Tensor, nn
 
 from torchcrf_scan.checks import from_values
 from torchcrf_scan.config import RUN_TIME, InferenceConfig, ModelConfig
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.whole_file import write_whole
 
 PRETRAINED = "encoder"
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PADDED = "thresholds"  # suffix of the names of tensors that are padded with infinity
+LARGEST = 1e4  # of a weight; ours are below 50, and an encoder of larger ones overflows single precision
+MOST_CONFIG, MOST_WEIGHTS = 1 << 20, 1 << 29  # bytes of the files
 
 
 def find_weights(name_or_path: str | Path) -> Path:
@@ -31,7 +34,7 @@ def find_weights(name_or_path: str | Path) -> Path:
     if (shipped / str(name_or_path) / CONFIG).is_file():
         return shipped / str(name_or_path)
     names = sorted(entry.name for entry in shipped.iterdir()) if shipped.is_dir() else []
-    raise ValueError(
+    raise TorchCRFScanError(
         f"name_or_path: expected a folder with config.json or one of {', '.join(names) or 'no'} shipped models, got {path}"
     )
 
@@ -56,9 +59,9 @@ def read_config(folder: Path, features: Mapping[str, Any], inference: Mapping[st
     """
     path = folder / CONFIG
     try:
-        config = model_config(json.loads(path.read_text()))
+        config = model_config(json.loads(_bytes(path, MOST_CONFIG)))
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise TorchCRFScanError(f"{path}: {error}") from error
     return replace(config, inference=replace(config.inference, **inference), features=replace(config.features, **features))
 
 
@@ -95,11 +98,26 @@ def load_state(model: nn.Module, folder: Path, fresh: Mapping[str, Tensor]) -> N
 
     path = folder / WEIGHTS
     try:
-        saved = load(path.read_bytes())
+        saved = load(_bytes(path, MOST_WEIGHTS))
         model.load_state_dict({**fresh, **saved})
-    except (SafetensorError, RuntimeError) as error:
-        raise ValueError(f"{path}: expected the tensors of the model that {CONFIG} describes, got {error}") from error
-    for name, value in saved.items():
-        is_right = ~torch.isnan(value) if name.endswith(PADDED) else torch.isfinite(value)
+    except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
+        raise TorchCRFScanError(f"{path}: expected the tensors of the model that {CONFIG} describes, got {error}") from error
+    check_weights(str(path), saved)
+
+
+def check_weights(where: str, weights: Mapping[str, Tensor]) -> None:
+    """Raises ValueError for the first tensor that is not finite, or beyond `LARGEST`. where: for the message."""
+    for name, value in weights.items():
+        size = value.double().abs()
+        is_right = (size <= LARGEST) | (torch.isinf(size) if name.endswith(PADDED) else False)
         if not is_right.all():
-            raise ValueError(f"{path}: {name}: expected finite numbers, got {value[~is_right][0]}")
+            raise TorchCRFScanError(f"{where}: {name}: expected finite numbers within {LARGEST:g}, got {value[~is_right][0]}")
+
+
+def _bytes(path: Path, most: int) -> bytes:
+    """The content of a file; raises ValueError for one that is longer than any model's."""
+    with path.open("rb") as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise TorchCRFScanError(f"{path}: expected at most {most} bytes, got more")
+    return content

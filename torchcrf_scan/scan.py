@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchcrf_scan.beams import FARTHEST, Bools, Floats, Ints, bearings_of, check_sensor, times_of, vector
+from torchcrf_scan.errors import TorchCRFScanError
 
 BACKGROUND = 0
 OUTLIER = -1
 MAX_RANGE_MARGIN = 0.05  # spec 0.2: a range this close to range_max is a beam without return
+SHORTEST, LONGEST = 1e-6, 1e9  # seconds between two scans; what is beyond would not survive single precision as a speed
 CLOSED_SPAN = float(np.radians(315.0))  # a scan that spans at least this much has neighbours across +-180 deg (A-06)
 
 
@@ -156,7 +158,7 @@ class Annotation:
 
 @dataclass(frozen=True, slots=True)
 class ScanPair:
-    """Two consecutive scans `dt` > 0 seconds apart, with or without annotation.
+    """Two consecutive scans `dt` seconds apart, `SHORTEST` to `LONGEST`, with or without annotation.
 
     `sequence` names the recording (pairs of one sequence overlap in time: never split one between training and test), `name`
     the pair, `origin` where the data comes from. `initial_motion` (3,) is a guess of the background's `T_target_source`, from
@@ -173,8 +175,8 @@ class ScanPair:
     initial_motion: Floats | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.dt < np.inf:
-            raise ValueError(f"dt: expected a finite number of seconds above 0, got {self.dt}")
+        if not SHORTEST <= self.dt <= LONGEST:
+            raise TorchCRFScanError(f"dt: expected seconds between {SHORTEST:g} and {LONGEST:g}, got {self.dt}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -268,6 +268,9 @@ def test_evaluate_names_the_bad_argument(
     pair = read_pair(pairs_dir / "sim_s0_000.npz")
     write_pair(tmp_path / "bare.npz", replace(pair, annotation=None))
     assert "bare.npz: expected an annotated pair" in fail(capsys, "evaluate", tmp_path / "bare.npz", "--method=static")
+    (tmp_path / "a.log").write_text("FLASER 1 2.0 0 0 0 0 0 0 1.0 host 1.0\n")
+    message = fail(capsys, "evaluate", tmp_path / "a.log", "--method=static")
+    assert "a.log: expected an annotated pair file (.npz), got a CARMEN log, which has no annotation" in message
     (tmp_path / "other").mkdir()
     write_prediction(tmp_path / "other" / "sim_s0_000.npz", moving_pair[1])
     message = fail(capsys, "evaluate", pairs_dir / "sim_s0_000.npz", "--predictions", tmp_path / "other")

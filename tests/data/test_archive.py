@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchcrf_scan.data.archive import read_arrays
+from torchcrf_scan.data.archive import ZIP, read_arrays
+from torchcrf_scan.data.limits import MOST_ARCHIVE
 
 
 def head_of(shape: tuple[int, ...], form: str = "<f8") -> bytes:
@@ -43,6 +44,14 @@ def test_a_bomb_is_refused_unread(tmp_path: Path) -> None:
         read_arrays(path, ("a",))
     assert tracemalloc.get_traced_memory()[1] < 2_000_000
     tracemalloc.stop()
+
+
+def test_a_directory_too_large_to_hold_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "a.npz").open("wb") as file:
+        file.write(ZIP)
+        file.truncate(MOST_ARCHIVE + 1)  # without a block on the disk
+    with pytest.raises(ValueError, match=rf"a\.npz: expected at most {MOST_ARCHIVE} bytes, got {MOST_ARCHIVE + 1}"):
+        read_arrays(tmp_path / "a.npz", ("a",))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import sqlite3
 import struct
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -254,10 +255,30 @@ def test_folders_with_wrong_metadata(tmp_path: Path) -> None:
         next(read_scans(path))
     (path / "metadata.yaml").unlink()
     assert len(list(read_scans(path))) == 2  # a recorder that was killed leaves none
-    for text in ("[", "a: b", ""):
+    laughs = ["a0: &a0 [1, 1, 1, 1]", *(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}, *a{k - 1}, *a{k - 1}]" for k in range(1, 20))]
+    for text in ("[", "a: b", "", "\0", "\n".join(laughs)):
         (path / "metadata.yaml").write_text(text)
         with pytest.raises(ValueError, match=r"metadata\.yaml: expected a list of files, got"):
             next(read_scans(path))
+
+
+def test_a_database_that_computes_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, "sqlite file", drive(2))
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("ALTER TABLE messages RENAME TO other")
+        endless = "WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) SELECT k AS id, 1 AS topic_id FROM n"
+        base.execute(f"CREATE VIEW messages AS {endless}")
+    with pytest.raises(ValueError, match=r"expected a database with topics, got the view or trigger 'messages'"):
+        list(read_scans(path))
+
+
+def test_a_database_of_other_types_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, "sqlite file", drive(2))
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("UPDATE messages SET timestamp = 'text', data = 'text'")
+        base.commit()
+    with pytest.raises(ValueError, match=f"row 1: expected a {LASER}, got"):
+        list(read_scans(path))
 
 
 @pytest.mark.parametrize(("form", "module"), [("ros1 bz2", ros1_bag), ("mcap file", mcap_bag)])

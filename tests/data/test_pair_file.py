@@ -194,7 +194,7 @@ WRONG: list[tuple[str, Any, str]] = [
     ("source_bearings", np.ones(5), r"shape \(6\), got \(5,\)"),
     ("source_bearings", np.array([0, 1, 2, np.nan, 3, 4]), "finite bearings, got nan at index 3"),
     ("target_bearings", np.arange(-2.0, 3.0) * 90, r"radians of one turn, got a span of 360.0; are these degrees\?"),
-    ("dt", np.float64(0.0), "a finite number above 0.0, got 0.0"),
+    ("dt", np.float64(0.0), "seconds between 1e-06 and 1e\\+09, got 0.0"),
     ("dt", np.float64(np.inf), "got inf"),
     ("dt", np.ones(1), r"shape \(\), got \(1,\)"),
     ("association", np.ones(6), "dtype int, got float64"),

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jsonargparse import ArgumentError
 
-from torchcrf_scan.experiment.parser import DEEPEST, MOST_VALUES, check_size, config_of, load_yaml, settings_parser
+from torchcrf_scan.data.bounded_yaml import DEEPEST, MOST_VALUES, check_size
+from torchcrf_scan.experiment.parser import config_of, load_yaml, settings_parser
 from torchcrf_scan.experiment.settings import RunConfig
 
 
@@ -73,6 +74,12 @@ def test_whole_numbers_are_taken_for_fractions() -> None:
 def test_a_file_that_is_no_settings_is_refused(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "file.yaml").write_text(text)
     with pytest.raises(ArgumentError, match=message):
+        parse(f"--config={tmp_path / 'file.yaml'}")
+
+
+def test_a_file_of_other_bytes_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file.yaml").write_bytes(b"data: \xff\n")
+    with pytest.raises(ArgumentError, match="expected a text, got 'utf-8' codec can't decode byte 0xff"):
         parse(f"--config={tmp_path / 'file.yaml'}")
 
 

@@ -76,6 +76,14 @@ def test_a_broken_file_is_named(content: bytes, tmp_path: Path) -> None:
         store.read()
 
 
+@pytest.mark.parametrize("part", ["model", "best"])
+def test_weights_that_are_no_numbers_are_refused(part: str, tmp_path: Path) -> None:
+    store = Store(tmp_path, {})
+    store.write(2, state(2) | {part: {"chain.weight": torch.tensor([1.0, torch.nan])}})
+    with pytest.raises(ValueError, match=rf"checkpoint\.pt: {part}: chain\.weight: expected finite numbers .*, got nan"):
+        store.read()
+
+
 def test_all_generators_go_on_where_they_were(tmp_path: Path) -> None:
     def draw() -> tuple[float, float, float]:
         return float(torch.rand(())), float(np.random.rand()), random.random()

@@ -22,9 +22,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def build_level(level: str, parts: list[str], folder: Path) -> list[str]:
         for part in parts:
             path = machine.library(folder, part, level)
-            beside = folder / f".{path.name}"
-            beside.write_bytes(b"code of " + part.encode())
-            build._publish(beside, path, {f"{part}.entry": ["float"]})
+            path.write_bytes(b"code of " + part.encode())
+            build._list_entries(path, {f"{part}.entry": ["float"]})
             build._remove_older(path, part, level)
         return parts
 

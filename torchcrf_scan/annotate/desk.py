@@ -13,6 +13,7 @@ from torchcrf_scan.annotate.fit import Scans
 from torchcrf_scan.annotate.history import History
 from torchcrf_scan.annotate.queue import confidence_of, neighbour, order
 from torchcrf_scan.annotate.store import Store
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 
 PAUSE = 60.0  # seconds without a change after which nobody is at work
@@ -54,7 +55,7 @@ class Desk:
         for name, case in self.cases.items():
             saved = store.read(name)
             if saved is not None and not (_is_same(saved.source, case.pair.source) and _is_same(saved.target, case.pair.target)):
-                raise ValueError(f"{store.folder}: expected annotations of these scans, got {store.path(name)} of others")
+                raise TorchCRFScanError(f"{store.folder}: expected annotations of these scans, got {store.path(name)} of others")
         self.name = self.ring[0]
         self._open()
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchcrf_scan.annotate.fit import FOLLOWS, Scans, fit, search
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction
 
@@ -120,7 +121,7 @@ def assign(document: Document, points: Ints, label: int) -> Document:
         ValueError: a mover beyond the next free number.
     """
     if not UNKNOWN <= label <= min(len(document.motions), MOST_MOVERS):
-        raise ValueError(f"expected a mover up to {min(len(document.motions), MOST_MOVERS)}, got {label}")
+        raise TorchCRFScanError(f"expected a mover up to {min(len(document.motions), MOST_MOVERS)}, got {label}")
     if not len(points):
         return document
     concerned, is_fresh = {int(k) for k in document.label[points]} | {label}, not (document.label == label).any()

@@ -22,6 +22,7 @@ from torchcrf_scan.annotate.document import UNKNOWN, Document
 from torchcrf_scan.annotate.fit import FOLLOWS
 from torchcrf_scan.annotate.keys import ACTIONS, legend
 from torchcrf_scan.annotate.picture import Picture, look
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry.velocity import ground_velocity
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints
 from torchcrf_scan.viz.marks import NOTE, WRONG
@@ -290,7 +291,7 @@ class Page:
     def _associate(self, key: str, is_fast: bool) -> None:
         target = self.picture.target.selected.indices
         if len(target) != 1 or not len(self.chosen):
-            raise ValueError("select points, and with Shift one ring to associate them with")
+            raise TorchCRFScanError("select points, and with Shift one ring to associate them with")
         self._mend(np.array(target))
 
     def _shift(self, key: str, is_fast: bool) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from torchcrf_scan.baselines.cloud import Cloud, fit_motion
 from torchcrf_scan.baselines.labels import IDENTITY, all_outliers, as_background
 from torchcrf_scan.baselines.trimmed_icp import register_trimmed
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import OUTLIER, Floats, Ints, PairPrediction, ScanPair
 
@@ -83,10 +84,10 @@ def choose_gate(shares: Floats, gates: Sequence[float] = GATES) -> float:
     """
     shares = np.asarray(shares, dtype=np.float64)
     if shares.ndim != 2 or shares.shape[1] != len(gates):
-        raise ValueError(f"shares: expected shape (P, {len(gates)}), got {shares.shape}")
+        raise TorchCRFScanError(f"shares: expected shape (P, {len(gates)}), got {shares.shape}")
     telling = shares[np.isfinite(shares).all(-1)]
     if not len(telling):
-        raise ValueError("shares: expected at least one pair with annotated points, got none")
+        raise TorchCRFScanError("shares: expected at least one pair with annotated points, got none")
     return gates[int(np.abs(telling.mean(0) - FOUND).argmin())]
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.causes.movers import TrueMover
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
 from torchcrf_scan.inference.start import Start, beyond_reach, nearest_association
@@ -60,7 +61,7 @@ def with_true_motions(model: JointScanCRF, pair: ScanPair, trace: SearchTrace) -
 def annotation_of(pair: ScanPair) -> Annotation:
     """The annotation; raises ValueError for a pair without one."""
     if pair.annotation is None:
-        raise ValueError(f"pair {pair.name!r}: expected an annotation, got none")
+        raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
     return pair.annotation
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from torchcrf_scan.data.pair_file import write_pair
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import ScanPair
 
 BATCH = 32
@@ -113,7 +114,7 @@ def compare(pairs: Sequence[ScanPair], model: str, other: Path, repeats: int) ->
         repeats: timed calls of every task, after one to warm up.
     """
     if not (other / "torchcrf_scan" / "__init__.py").is_file():
-        raise ValueError(f"--beside: expected a folder that holds torchcrf_scan, got {other}")
+        raise TorchCRFScanError(f"--beside: expected a folder that holds torchcrf_scan, got {other}")
     here = Path(__file__).resolve().parents[2]
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -149,5 +150,5 @@ def _ask(process: subprocess.Popen[str], task: str, turn: int) -> float:
     if not answer:
         with suppress(BrokenPipeError):
             process.stdin.close()
-        raise ValueError(f"--beside: expected a time of {task}, got a process that ended with {process.wait()}")
+        raise TorchCRFScanError(f"--beside: expected a time of {task}, got a process that ended with {process.wait()}")
     return float(answer)

@@ -14,6 +14,7 @@ from typing import Any
 from torchcrf_scan.benchmark.plan import with_backend
 from torchcrf_scan.benchmark.scenes import in_mode
 from torchcrf_scan.data.pair_file import read_pair, write_pair
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
 
@@ -42,7 +43,7 @@ def ask_fresh_process(model: str, backend: str, mode: str, pairs: Sequence[ScanP
         command = [sys.executable, "-c", CHILD, model, backend, mode, *map(str, files)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise ValueError(f"fresh process: expected an answer, got {done.stderr.strip().splitlines()[-1:]}")
+        raise TorchCRFScanError(f"fresh process: expected an answer, got {done.stderr.strip().splitlines()[-1:]}")
     told: dict[str, Any] = json.loads(done.stdout)
     return told
 

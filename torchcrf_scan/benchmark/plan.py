@@ -9,6 +9,7 @@ from itertools import product
 from typing import Any
 
 from torchcrf_scan.benchmark.scenes import MODES, in_mode, street_pairs
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
 
@@ -92,7 +93,7 @@ def choose_backends(wanted: Sequence[str]) -> tuple[str, ...]:
     """The backends wanted, by default all. Raises ValueError for an unknown one."""
     for name in wanted:
         if name not in BACKENDS:
-            raise ValueError(f"--backends: expected some of {', '.join(BACKENDS)}, got {name}")
+            raise TorchCRFScanError(f"--backends: expected some of {', '.join(BACKENDS)}, got {name}")
     return tuple(wanted) or BACKENDS
 
 

@@ -12,6 +12,7 @@ from torchcrf_scan.annotate.store import Store
 from torchcrf_scan.commands.arguments import PairPlace, find_pairs, load_model, make_folder
 from torchcrf_scan.commands.failures import LeftOut, attempt
 from torchcrf_scan.data.options import ReadOptions
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
 
@@ -60,7 +61,7 @@ def annotate(
     try:
         from torchcrf_scan.annotate.server import ADDRESS, make_server, serve
     except ImportError as error:
-        raise ValueError(f"annotate: expected bokeh (pip install torchcrf-scan[annotate]), got {error}") from error
+        raise TorchCRFScanError(f"annotate: expected bokeh (pip install torchcrf-scan[annotate]), got {error}") from error
     _check_numbers(port, outlier_distance)
     failures: list[str] = []
     left_out = LeftOut()
@@ -71,7 +72,7 @@ def annotate(
     for failure in failures:
         print(f"torchcrf-scan annotate: error: {failure}", file=sys.stderr)
     if not cases:
-        raise ValueError(f"files: expected pairs to annotate, got none{left_out}")
+        raise TorchCRFScanError(f"files: expected pairs to annotate, got none{left_out}")
     server, port = make_server(Desk(cases, store, outlier_distance), port)
     address = f"http://{ADDRESS}:{port}/"
     print(f"{len(cases)} pairs, annotations in {output}, Ctrl-C ends{left_out}: {address}", flush=True)
@@ -84,9 +85,9 @@ def annotate(
 def _check_numbers(port: int, outlier_distance: float | None) -> None:
     """Raises ValueError for a port or a distance that cannot be."""
     if not 0 <= port < 1 << 16:
-        raise ValueError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
+        raise TorchCRFScanError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
     if outlier_distance is not None and not 0 < outlier_distance < float("inf"):
-        raise ValueError(f"--outlier_distance: expected metres above 0, got {outlier_distance}")
+        raise TorchCRFScanError(f"--outlier_distance: expected metres above 0, got {outlier_distance}")
 
 
 def _check_apart(places: list[PairPlace], store: Store) -> None:
@@ -94,7 +95,7 @@ def _check_apart(places: list[PairPlace], store: Store) -> None:
     for place in places:
         path = store.path(place.name)
         if path.exists() and path.samefile(place.path):
-            raise ValueError(f"--output: expected another folder than that of the pairs, got {store.folder}")
+            raise TorchCRFScanError(f"--output: expected another folder than that of the pairs, got {store.folder}")
 
 
 def _cases(places: list[PairPlace], network: JointScanCRF, failures: list[str]) -> list[Case]:

@@ -15,6 +15,7 @@ from torchcrf_scan.data.formats import PAIR, find_format, read_recording
 from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.recording import Recording
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import ScanPair
 
@@ -36,21 +37,21 @@ def load_model(
     """
     if threads is not None:
         if threads < 1:
-            raise ValueError(f"--threads: expected at least 1, got {threads}")
+            raise TorchCRFScanError(f"--threads: expected at least 1, got {threads}")
         torch.set_num_threads(threads)
     changes: dict[str, Any] = {} if candidates is None else {"candidates": candidates}
     try:
         model = JointScanCRF.from_pretrained(name, **changes)
     except ValueError as error:
-        raise ValueError(f"--model {name}: {error}") from error
+        raise TorchCRFScanError(f"--model {name}: {error}") from error
     try:
         model.config = model.config.with_limit(outlier_distance)
     except ValueError as error:
-        raise ValueError(f"--{error}") from error
+        raise TorchCRFScanError(f"--{error}") from error
     try:
         return model.to(device)
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"--device: expected one that torch can use here, got {device} ({error})") from error
+        raise TorchCRFScanError(f"--device: expected one that torch can use here, got {device} ({error})") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,12 +87,12 @@ def find_pairs(patterns: Sequence[str], every: int, failures: list[str], options
     """
     paths = PairFiles(*patterns).paths
     if every < 1:
-        raise ValueError(f"--every: expected at least 1, got {every}")
+        raise TorchCRFScanError(f"--every: expected at least 1, got {every}")
     pair_files = {path for path in paths if attempt([], find_format, path) is PAIR}
     if len(pair_files) == len(paths) and (every > 1 or replace(options, on_bad=None) != AS_RECORDED):
         every_nth = f"--every: expected a log to take every {every}-th pair of"
         told = every_nth if every > 1 else "--topic, --odometry, --no_return: expected a log to read with them"
-        raise ValueError(f"{told}, got pair files alone")
+        raise TorchCRFScanError(f"{told}, got pair files alone")
     found = []
     for path in paths:
         if path in pair_files:
@@ -106,11 +107,11 @@ def read_one(file: str, number: int | None, options: ReadOptions = AS_RECORDED) 
     """The pair of a pair file (number None), or one of the pairs of a log."""
     if find_format(file) is PAIR:
         if number is not None:
-            raise ValueError(f"--number: expected none but with a log, got {number} with {file}")
+            raise TorchCRFScanError(f"--number: expected none but with a log, got {number} with {file}")
         return read_pair(file)
     log = read_recording(file, options)
     if number is None or not 0 <= number < len(log):
-        raise ValueError(f"--number: expected which pair of {file}, 0 to {len(log) - 1}, got {number}")
+        raise TorchCRFScanError(f"--number: expected which pair of {file}, 0 to {len(log) - 1}, got {number}")
     return log[number]
 
 
@@ -119,7 +120,7 @@ def _each_once(places: Iterable[PairPlace]) -> list[PairPlace]:
     for place in places:
         first = found.setdefault(place.name, place)
         if first is not place and not first.path.samefile(place.path):
-            raise ValueError(f"{place}: expected pair names that differ, got the name of {first} again")
+            raise TorchCRFScanError(f"{place}: expected pair names that differ, got the name of {first} again")
     return list(found.values())
 
 
@@ -133,7 +134,7 @@ def make_folder(option: str, folder: str | Path) -> Path:
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise ValueError(f"{option}: expected a folder, got {folder}, where a file is in the way") from error
+        raise TorchCRFScanError(f"{option}: expected a folder, got {folder}, where a file is in the way") from error
     return Path(folder)
 
 
@@ -141,7 +142,7 @@ def check_output(output: str, log: str) -> None:
     """Raises ValueError for an output that is a folder, or would replace the log that it is made of."""
     path = Path(output)
     if path.exists() and not path.is_file():
-        raise ValueError(
+        raise TorchCRFScanError(
             f"--output: expected a file to write, got {output!r}, {'a folder' if path.is_dir() else 'a device or pipe'}"
         )
     check_other(output, log)
@@ -151,7 +152,7 @@ def check_other(output: str, log: str) -> None:
     """Raises ValueError for an output that would replace the log that it is made of."""
     path = Path(output)
     if path.exists() and Path(log).exists() and path.samefile(log):
-        raise ValueError(f"--output: expected another file than the log, got {output}")
+        raise TorchCRFScanError(f"--output: expected another file than the log, got {output}")
 
 
 def batches(items: Sequence[Item]) -> Iterator[Sequence[Item]]:

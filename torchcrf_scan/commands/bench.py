@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchcrf_scan.commands.arguments import listed, make_folder
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED
 
 if TYPE_CHECKING:
@@ -57,10 +58,10 @@ def bench(
 
     for name, values in {"beams": beams, "batches": batches, "threads": threads}.items():
         if not values or min(values) < 1:
-            raise ValueError(f"--{name}: expected numbers of at least 1, got {list(values)}")
+            raise TorchCRFScanError(f"--{name}: expected numbers of at least 1, got {list(values)}")
     for name, value in {"repeats": repeats, "simulated": simulated}.items():
         if value < 1:
-            raise ValueError(f"--{name}: expected at least 1, got {value}")
+            raise TorchCRFScanError(f"--{name}: expected at least 1, got {value}")
     path = Path(output)
     make_folder("--output", path.parent)
     recorded = tuple(PairFiles(*listed(pairs))) if pairs else ()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from torchcrf_scan.commands.arguments import find_files, load_model, make_folder
 from torchcrf_scan.data.pair_file import read_pair
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED, WEIGHTS
 
 
@@ -28,11 +29,11 @@ def calibrate(pair_files: list[str], output: str, *, model: str = PRETRAINED, th
     pairs = {path: read_pair(path) for path in find_files(pair_files)}
     for path, pair in pairs.items():
         if pair.annotation is None:
-            raise ValueError(f"{path}: expected an annotated pair (keys association and cluster), got one without")
+            raise TorchCRFScanError(f"{path}: expected an annotated pair (keys association and cluster), got one without")
     network = load_model(model, threads=threads)
     folder = make_folder("--output", output)
     if any(folder.iterdir()) and not (folder / WEIGHTS).is_file():
-        raise ValueError(f"--output: expected a new folder or one of a saved model, got {output} with other files")
+        raise TorchCRFScanError(f"--output: expected a new folder or one of a saved model, got {output} with other files")
     fitted, parts = calibrate_on(network, list(pairs.values()))
     trained_on = TrainedOn.of_model(model).plus(pairs.values())
     fitted.save_pretrained(folder)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchcrf_scan.commands.arguments import batches, make_folder
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.scan import PairPrediction, ScanPair
@@ -34,9 +35,9 @@ class Traced:
 def check(output: str | None, worst: int, causes: bool) -> None:
     """Raises ValueError for options that need `--causes`."""
     if not causes and output is not None:
-        raise ValueError(f"--output: expected none without --causes, got {output}")
+        raise TorchCRFScanError(f"--output: expected none without --causes, got {output}")
     if worst < 0:
-        raise ValueError(f"--worst: expected a number of pairs, 0 or more, got {worst}")
+        raise TorchCRFScanError(f"--worst: expected a number of pairs, 0 or more, got {worst}")
 
 
 def trace(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Traced:

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 from torchcrf_scan.commands.arguments import listed, load_model
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.whole_file import write_whole
 
@@ -54,14 +55,14 @@ def drives(
     names = listed(worlds)
     unknown = [name for name in names if name not in NAMED_WORLDS]
     if unknown or not names:
-        raise ValueError(f"--worlds: expected some of {', '.join(NAMED_WORLDS)}, got {', '.join(unknown) or 'none'}")
+        raise TorchCRFScanError(f"--worlds: expected some of {', '.join(NAMED_WORLDS)}, got {', '.join(unknown) or 'none'}")
     for name, value, least in (("scans", scans, 2), ("count", count, 1), ("seed", seed, 0)):
         if value < least:
-            raise ValueError(f"--{name}: expected at least {least}, got {value}")
+            raise TorchCRFScanError(f"--{name}: expected at least {least}, got {value}")
     try:
         import trackeval  # noqa: F401
     except ImportError as error:
-        raise ValueError(f"expected the library trackeval, which scores tracks (extra `tracking`), got {error}") from error
+        raise TorchCRFScanError(f"expected the library trackeval, which scores tracks (extra `tracking`), got {error}") from error
     loaded = load_model(model)
     print("| world | " + " | ".join(HEADER.values()) + " |\n|" + "---|" * (len(HEADER) + 1))
     rows = {}

@@ -20,7 +20,9 @@ from torchcrf_scan.commands.causes import explain
 from torchcrf_scan.commands.frames import FrameOffset, Turn, match_displaced
 from torchcrf_scan.commands.rounds import tell_rounds
 from torchcrf_scan.commands.sequences import by_sequence, figures_of, rows_of, without_nan
+from torchcrf_scan.data.formats import PAIR, find_format
 from torchcrf_scan.data.pair_file import read_pair, read_prediction
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.scan import PairPrediction, ScanPair
@@ -149,16 +151,20 @@ def _score(
 def _check_read(predictions: str | None, method: tuple[str | None, ...], settings: tuple[float | None, ...]) -> None:
     """Refuses what has no meaning for predictions that are read. method: also the model. settings: of the model."""
     if predictions is not None and any(given is not None for given in method):
-        raise ValueError("--predictions: expected no --method and no --model beside it, got both")
+        raise TorchCRFScanError("--predictions: expected no --method and no --model beside it, got both")
     if predictions is not None and any(given is not None for given in settings):
-        raise ValueError("--predictions: expected no --candidates and no --outlier_distance beside it, as nothing is computed")
+        raise TorchCRFScanError(
+            "--predictions: expected no --candidates and no --outlier_distance beside it, as nothing is computed"
+        )
 
 
 def _check_joint(asked: dict[str, bool], method: str | None, others: tuple[object, ...]) -> None:
     """Refuses what is told of the model's own answers alone, by option, beside another method. others: must be None."""
     for option in [name for name, is_asked in asked.items() if is_asked]:
         if method not in (None, "joint") or any(other is not None for other in others):
-            raise ValueError(f"{option}: expected --method joint, no --predictions and no displaced frames beside it, got others")
+            raise TorchCRFScanError(
+                f"{option}: expected --method joint, no --predictions and no displaced frames beside it, got others"
+            )
 
 
 def _displacement(metres: float | None, turn: Turn | None, predictions: str | None) -> FrameOffset | None:
@@ -166,15 +172,20 @@ def _displacement(metres: float | None, turn: Turn | None, predictions: str | No
     if metres is None and turn is None:
         return None
     if predictions is not None:
-        raise ValueError("--frame_offset, --frame_turn: expected no --predictions beside them, got both")
+        raise TorchCRFScanError("--frame_offset, --frame_turn: expected no --predictions beside them, got both")
     return FrameOffset(metres or 0.0, turn or 0.0)
 
 
 def _annotated_pairs(patterns: Sequence[str]) -> dict[Path, ScanPair]:
-    pairs = {path: read_pair(path) for path in find_files(patterns)}
+    files = find_files(patterns)
+    for path in files:
+        form = find_format(path)
+        if form is not None and form is not PAIR:
+            raise TorchCRFScanError(f"{path}: expected an annotated pair file (.npz), got a {form.name}, which has no annotation")
+    pairs = {path: read_pair(path) for path in files}
     for path, pair in pairs.items():
         if pair.annotation is None:
-            raise ValueError(f"{path}: expected an annotated pair (keys association and cluster), got one without")
+            raise TorchCRFScanError(f"{path}: expected an annotated pair (keys association and cluster), got one without")
     return pairs
 
 
@@ -183,17 +194,19 @@ def _read_predictions(paths: Sequence[Path], folder: Path) -> list[PairPredictio
     missing = [file for file in files if not file.is_file()]
     if missing:
         got = f"none for {len(missing)} of {len(files)}, the first {missing[0].name}"
-        raise ValueError(f"--predictions {folder}: expected a file for every pair, got {got}")
+        raise TorchCRFScanError(f"--predictions {folder}: expected a file for every pair, got {got}")
     return [read_prediction(file) for file in files]
 
 
 def _run(name: str, load: Loader, pairs: Sequence[ScanPair], displacement: FrameOffset | None, seed: int) -> list[PairPrediction]:
     if name not in METHODS:
-        raise ValueError(f"--method: expected one of {', '.join(METHODS)}, got {name}")
+        raise TorchCRFScanError(f"--method: expected one of {', '.join(METHODS)}, got {name}")
     if displacement is None:
         return _in_batches(METHODS[name](load), pairs)
     if name not in frames.METHODS:
-        raise ValueError(f"--method: expected one of {', '.join(frames.METHODS)} with --frame_offset or --frame_turn, got {name}")
+        raise TorchCRFScanError(
+            f"--method: expected one of {', '.join(frames.METHODS)} with --frame_offset or --frame_turn, got {name}"
+        )
     offsets = displacement.draw(len(pairs), torch.Generator().manual_seed(seed))
     return _in_batches(partial(match_displaced, name, load()), list(zip(pairs, offsets, strict=True)))
 

@@ -11,6 +11,7 @@ import yaml
 from jsonargparse import ArgumentError, ArgumentParser
 
 from torchcrf_scan.commands.parser import CommandParser
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.experiment.parser import config_of, load_yaml, settings_parser
 from torchcrf_scan.experiment.settings import RunConfig
 
@@ -29,7 +30,9 @@ def experiment(*, ablations: str | None = None, **settings: Any) -> int:
     config = config_of(settings)
     if config.has_steps and config.model.encoder.width == 0:
         got = config.first_order
-        raise ValueError(f"gradient.objective: expected none in an experiment without model.encoder (it fits in stages), got {got}")
+        raise TorchCRFScanError(
+            f"gradient.objective: expected none in an experiment without model.encoder (it fits in stages), got {got}"
+        )
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if ablations is not None:
         tables = run_ablations(config, read_variants(Path(ablations), config))
@@ -57,7 +60,7 @@ def read_variants(folder: Path, config: RunConfig) -> dict[str, RunConfig]:
     """
     files = sorted(folder.glob("*.yaml"))
     if not files:
-        raise ValueError(f"--ablations {folder}: expected a folder of .yaml files, got none")
+        raise TorchCRFScanError(f"--ablations {folder}: expected a folder of .yaml files, got none")
     parser = settings_parser(exit_on_error=False)
     variants: dict[str, RunConfig] = {}
     config = replace(config, experiment=replace(config.experiment, leave_out=()))
@@ -78,8 +81,8 @@ def read_variant(parser: ArgumentParser, file: Path, config: RunConfig) -> RunCo
     try:
         changes = load_yaml(file.read_text()) or {}
         if not isinstance(changes, dict):
-            raise ValueError(f"expected settings, one a line as NAME: VALUE, got {changes!r}")
+            raise TorchCRFScanError(f"expected settings, one a line as NAME: VALUE, got {changes!r}")
         base = parser.parse_object(asdict(config))
         return config_of(parser.instantiate(parser.parse_object(changes, base)))
     except (ArgumentError, yaml.YAMLError, ValueError, TypeError) as error:
-        raise ValueError(f"{file}: {error}") from error
+        raise TorchCRFScanError(f"{file}: {error}") from error

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchcrf_scan.baselines.start import label_nearest
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.fast.choice import can_decode
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.model import JointScanCRF
@@ -53,9 +54,9 @@ class FrameOffset:
 
     def __post_init__(self) -> None:
         if not 0 <= self.metres <= FARTHEST:
-            raise ValueError(f"--frame_offset: expected metres from 0 to {FARTHEST:g}, got {self.metres}")
+            raise TorchCRFScanError(f"--frame_offset: expected metres from 0 to {FARTHEST:g}, got {self.metres}")
         if self.turn != "any" and not 0 <= self.turn <= math.pi:
-            raise ValueError(f"--frame_turn: expected radians from 0 to pi, or any, got {self.turn}")
+            raise TorchCRFScanError(f"--frame_turn: expected radians from 0 to pi, or any, got {self.turn}")
 
     def __str__(self) -> str:
         turn = "turned anyhow" if self.turn == "any" else f"turned by {self.turn:g} rad"

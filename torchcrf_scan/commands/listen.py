@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from torchcrf_scan.commands.arguments import listed, load_model
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.live.listener import Answered, Listener
 from torchcrf_scan.live.network import LOOPBACK, Connection, Network
 from torchcrf_scan.pretrained import PRETRAINED
@@ -67,7 +68,7 @@ def listen(
         threads: number of threads that torch computes with; scans come one after the other, so more only wait for each other
     """
     if waiting < 1:
-        raise ValueError(f"--waiting: expected at least 1 scan, got {waiting}")
+        raise TorchCRFScanError(f"--waiting: expected at least 1 scan, got {waiting}")
     network = Network(domain, (LOOPBACK,), LOOPBACK) if loopback else Network(domain, listed(peers), interface)
     answering = ScanStream(load_model(model, None, device, threads), stream)
     names = {"topic": topic, "prefix": prefix, "world": world}

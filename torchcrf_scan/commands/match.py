@@ -14,6 +14,7 @@ from torchcrf_scan.commands.arguments import batches, find_pairs, load_model, ma
 from torchcrf_scan.commands.failures import LeftOut, attempt, one_line
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.velocity import ground_velocity
 from torchcrf_scan.model import JointScanCRF
@@ -139,7 +140,7 @@ def _prediction_path(name: str, folder: Path) -> Path:
         try:
             read_prediction(target)
         except ValueError as error:
-            raise ValueError(f"--output {folder}: expected to replace nothing but predictions, got {target}") from error
+            raise TorchCRFScanError(f"--output {folder}: expected to replace nothing but predictions, got {target}") from error
     return target
 
 

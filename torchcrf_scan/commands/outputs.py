@@ -11,6 +11,7 @@ from types import TracebackType
 from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.data.track_file import writing_tracks
 from torchcrf_scan.data.trajectory_file import writing_trajectory
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.result import ScanResult
 
 Add = Callable[[ScanResult], None]
@@ -91,7 +92,7 @@ def movie_file(path: Path, seconds: float, speed: float, is_in_world: bool) -> I
 def check_speed(speed: float) -> None:
     """Raises ValueError for a speed that a movie cannot have."""
     if not 0 < speed < float("inf"):
-        raise ValueError(f"--speed: expected more than 0 times the recording's own, got {speed}")
+        raise TorchCRFScanError(f"--speed: expected more than 0 times the recording's own, got {speed}")
 
 
 @contextmanager

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import NoReturn
 
-from jsonargparse import ArgumentParser
+from torchcrf_scan.experiment.parser import SettingsParser
 
 ALIKE = 60.0  # of 100, the least likeness of an option that may have been meant
 UNKNOWN = "unrecognized arguments: "
@@ -15,15 +14,8 @@ MISTYPED = re.compile(r"Parser key \"(\S+)\":\s+Expected an? <class '(\w+)'>\. G
 KINDS = {"int": "a whole number", "float": "a finite number", "bool": "true or false"}
 
 
-class CommandParser(ArgumentParser):
-    """An `ArgumentParser` whose errors are one line each."""
-
-    def parse_args(self, args: Sequence[str] | None = None, *more: Any, **options: Any) -> Any:  # type: ignore[override]
-        """As in jsonargparse; a file of settings that is no text is bad usage, too."""
-        try:
-            return super().parse_args(args, *more, **options)
-        except UnicodeDecodeError as error:
-            self.error(f"--config: expected a YAML file, got one that is no text ({error})", error)
+class CommandParser(SettingsParser):
+    """A parser whose errors are one line each."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Ends with exit code 2 and one line; an unknown option is told with the nearest right one of the command."""

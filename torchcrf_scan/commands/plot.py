@@ -8,6 +8,7 @@ from torchcrf_scan.commands.arguments import load_model, read_one
 from torchcrf_scan.commands.failures import LeftOut
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import read_prediction
+from torchcrf_scan.errors import TorchCRFScanError
 
 
 def plot(
@@ -32,9 +33,9 @@ def plot(
     from torchcrf_scan.viz.plots import plot_pair, save_figure
 
     if prediction is not None and model is not None:
-        raise ValueError("--prediction: expected no --model beside it, got both")
+        raise TorchCRFScanError("--prediction: expected no --model beside it, got both")
     if Path(output).suffix.lower() != ".png":
-        raise ValueError(f"--output: expected a name ending in .png, got {output}")
+        raise TorchCRFScanError(f"--output: expected a name ending in .png, got {output}")
     left_out = LeftOut()
     pair = read_one(file, number, ReadOptions(topic, on_bad=left_out.add))
     answer = read_prediction(prediction) if prediction is not None else None

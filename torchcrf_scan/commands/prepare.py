@@ -5,6 +5,7 @@ from __future__ import annotations
 from tqdm import tqdm
 
 from torchcrf_scan.commands.arguments import listed
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.loops import machine
 
 LEVELS = ("x86-64-v2", "x86-64-v3", "generic")
@@ -24,7 +25,7 @@ def prepare(*, levels: tuple[str, ...] | str = ()) -> int:
 
     for level in listed(levels):
         if level not in LEVELS:
-            raise ValueError(f"--levels: expected some of {', '.join(LEVELS)}, got {level}")
+            raise TorchCRFScanError(f"--levels: expected some of {', '.join(LEVELS)}, got {level}")
     with tqdm(unit="part", disable=None) as bar:
 
         def progress(done: int, count: int) -> None:

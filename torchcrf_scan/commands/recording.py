@@ -21,6 +21,7 @@ from torchcrf_scan.data.formats import read_scans
 from torchcrf_scan.data.options import AUTO, ReadOptions
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.recording import log_name
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.result import ScanResult
 from torchcrf_scan.scan import Floats, Scan
@@ -79,11 +80,11 @@ class Options:
 
     def __post_init__(self) -> None:
         if self.every < 1:
-            raise ValueError(f"--every: expected at least 1, got {self.every}")
+            raise TorchCRFScanError(f"--every: expected at least 1, got {self.every}")
         if not 0 <= self.start < np.inf:
-            raise ValueError(f"--start: expected seconds from the first scan on, at least 0, got {self.start}")
+            raise TorchCRFScanError(f"--start: expected seconds from the first scan on, at least 0, got {self.start}")
         if self.end is not None and not self.end > self.start:
-            raise ValueError(f"--end: expected more seconds than --start = {self.start}, got {self.end}")
+            raise TorchCRFScanError(f"--end: expected more seconds than --start = {self.start}, got {self.end}")
 
     @property
     def reading(self) -> ReadOptions:
@@ -173,9 +174,9 @@ def process(
     ahead = list(islice(readings, LOOK_AHEAD))
     if not ahead:
         nothing = f"{log}: expected scans in the chosen time, got none"
-        raise ValueError(next(iter(report.failures), report.left_out.first or nothing))
+        raise TorchCRFScanError(next(iter(report.failures), report.left_out.first or nothing))
     if options.has_odometry and all(reading.odometry is None for reading in ahead):
-        raise ValueError(f"--use_odometry: expected a recording with odometry, got none in {log}")
+        raise TorchCRFScanError(f"--use_odometry: expected a recording with odometry, got none in {log}")
     begin = perf_counter()
     with (
         Outputs(outputs(typical_seconds(ahead)), report.failures) as add,

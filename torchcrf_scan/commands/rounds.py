@@ -13,6 +13,7 @@ from tqdm import tqdm
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.choices import COUPLINGS, SCHEDULES
 from torchcrf_scan.config import ModelConfig
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.features.candidates import Candidates, with_targets
 from torchcrf_scan.features.potentials import PairView, find_candidates
 from torchcrf_scan.inference import joint
@@ -43,7 +44,7 @@ def check(model: JointScanCRF) -> None:
     config = model.config
     in_turns = not COUPLINGS[config.coupling].chain and SCHEDULES[config.inference.schedule].takes_couplings
     if not (config.has_association and config.has_clusters and in_turns and config.inference.iterations > 0):
-        raise ValueError("--rounds: expected a model with rounds over two chains in turns (coupling motions), got another")
+        raise TorchCRFScanError("--rounds: expected a model with rounds over two chains in turns (coupling motions), got another")
 
 
 @torch.no_grad()

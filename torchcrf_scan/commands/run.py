@@ -16,6 +16,7 @@ from torchcrf_scan.commands.recording import DEFAULTS, MakeOutputs, Options, Str
 from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
 from torchcrf_scan.data.clean_log import clean_name, writing_clean
 from torchcrf_scan.data.recording import log_name
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.learning.ranks import join
 
 
@@ -45,9 +46,9 @@ def run(
     folders = _folders(logs, Path(output))
     check_speed(speed)
     if options.rerun is not None and len(logs) > 1:
-        raise ValueError(f"--rerun: expected one log to write {options.rerun} of, got {len(logs)}")
+        raise TorchCRFScanError(f"--rerun: expected one log to write {options.rerun} of, got {len(logs)}")
     if clean and options.every > 1:
-        raise ValueError(f"--clean: expected every scan to be taken, got --every {options.every}")
+        raise TorchCRFScanError(f"--clean: expected every scan to be taken, got --every {options.every}")
     viewers(options.visualize, options.rerun)  # an error now, not after the first scans
     make_stream = options.make_stream()
     failures: list[str] = []
@@ -69,7 +70,7 @@ def _folders(logs: Sequence[str], output: Path) -> dict[str, Path]:
         return {logs[0]: output}
     folders = {log: output / log_name(Path(log)) for log in logs}
     if len(set(folders.values())) < len(logs):
-        raise ValueError(f"logs: expected logs whose names differ, got {', '.join(logs)}")
+        raise TorchCRFScanError(f"logs: expected logs whose names differ, got {', '.join(logs)}")
     return folders
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from torchcrf_scan.commands.arguments import make_folder
 from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.errors import TorchCRFScanError
 
 
 def simulate(
@@ -34,7 +35,7 @@ def simulate(
     others = sorted(path.name for path in folder.glob("*.npz") if path.name not in simulated)
     if others:
         got = f"{len(others)} others, the first {others[0]}"
-        raise ValueError(f"--output {output}: expected a folder without .npz files but those of this run, got {got}")
+        raise TorchCRFScanError(f"--output {output}: expected a folder without .npz files but those of this run, got {got}")
     for name, pair in simulated.items():
         write_pair(folder / name, pair)
     print(f"{len(simulated)} pairs of {sequences} sequences in {folder}")
@@ -46,7 +47,7 @@ def _write_drive(path: Path, simulator: SimulatorConfig, scans: int, seed: int) 
     from torchcrf_scan.data.drive_file import write_drive
 
     if path.suffix.lower() != ".csv":
-        raise ValueError(f"--output: expected a name ending in .csv with --drive, got {path}")
+        raise TorchCRFScanError(f"--output: expected a name ending in .csv with --drive, got {path}")
     make_folder("--output", path.parent)
     write_drive(path, simulate_drive(simulator, scans, seed), simulator)
     print(f"{scans} scans of one drive in {path}")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from torchcrf_scan.data.limits import MOST_CHUNK
+from torchcrf_scan.errors import TorchCRFScanError
 
 DAMAGES = (OSError, EOFError, ValueError, KeyError, IndexError, struct.error)  # of unpacking and parsing what is damaged
 
@@ -62,15 +63,15 @@ class Bag(Protocol):
 def unpack(data: bytes, compression: str, size: int) -> bytes:
     """Unpacks a chunk of a stated size; raises ValueError if it is beyond the limit, or not of that size."""
     if size > MOST_CHUNK:
-        raise ValueError(f"expected chunks of at most {MOST_CHUNK} bytes, got one of {size}")
+        raise TorchCRFScanError(f"expected chunks of at most {MOST_CHUNK} bytes, got one of {size}")
     if compression in ("", "none"):
         return data
     makers: dict[str, Callable[[], Any]] = {"bz2": bz2.BZ2Decompressor, "lz4": _lz4, "zstd": _zstd}
     if compression not in makers:
-        raise ValueError(f"expected compression by {', '.join(makers)} or none, got {compression!r}")
+        raise TorchCRFScanError(f"expected compression by {', '.join(makers)} or none, got {compression!r}")
     unpacked = _decompress(makers[compression](), data, size + 1)
     if len(unpacked) != size:
-        raise ValueError(f"expected a chunk of {size} bytes, got {'more' if len(unpacked) > size else len(unpacked)}")
+        raise TorchCRFScanError(f"expected a chunk of {size} bytes, got {'more' if len(unpacked) > size else len(unpacked)}")
     return unpacked
 
 
@@ -79,7 +80,7 @@ def unpack_message(data: bytes) -> bytes:
     decompressor = _zstd()
     unpacked = _decompress(decompressor, data, MOST_CHUNK)
     if not decompressor.eof:
-        raise ValueError(f"expected a whole message of at most {MOST_CHUNK} bytes, got {len(unpacked)} and more")
+        raise TorchCRFScanError(f"expected a whole message of at most {MOST_CHUNK} bytes, got {len(unpacked)} and more")
     return unpacked
 
 
@@ -87,14 +88,14 @@ def _decompress(decompressor: Any, data: bytes, most: int) -> bytes:
     try:
         return decompressor.decompress(data, most)
     except Exception as error:  # each library has its own
-        raise ValueError(f"expected data that can be unpacked, got {error}") from error
+        raise TorchCRFScanError(f"expected data that can be unpacked, got {error}") from error
 
 
 def _lz4() -> Any:
     try:
         from lz4.frame import LZ4FrameDecompressor
     except ImportError as error:
-        raise ValueError(f"expected the library lz4, which unpacks this (extra `ros`), got {error}") from error
+        raise TorchCRFScanError(f"expected the library lz4, which unpacks this (extra `ros`), got {error}") from error
     return LZ4FrameDecompressor()
 
 
@@ -105,5 +106,7 @@ def _zstd() -> Any:
         try:
             from backports import zstd
         except ImportError as error:
-            raise ValueError(f"expected the library backports.zstd, which unpacks this (extra `ros`), got {error}") from error
+            raise TorchCRFScanError(
+                f"expected the library backports.zstd, which unpacks this (extra `ros`), got {error}"
+            ) from error
     return zstd.ZstdDecompressor()

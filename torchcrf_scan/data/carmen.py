@@ -14,6 +14,7 @@ from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.recording import Recording
 from torchcrf_scan.data.text_lines import Line, read_lines
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats, Scan
 
@@ -56,7 +57,7 @@ def _reading(laser: LaserLine, known: Survey, odometry: Floats | None, where: st
     try:
         scan = Scan.from_ranges(np.where(laser.ranges >= limit, np.nan, laser.ranges), bearings)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
+        raise TorchCRFScanError(f"{where}: {error}") from error
     robot = odometry if laser.robot is None else laser.robot
     sensor = None if robot is None else se2.compose(robot, known.mount)
     return Reading(scan, float(laser.stamps[known.clock]), sensor, laser.pose)

@@ -17,6 +17,7 @@ import numpy as np
 
 from torchcrf_scan.data.limits import check_beams
 from torchcrf_scan.data.text_lines import Line
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import Floats
 
 KIND = re.compile(r"(FLASER|RLASER|ROBOTLASER\d|RAWLASER\d) ")
@@ -59,7 +60,7 @@ def read_laser_line(line: Line, kind: str) -> LaserLine:
     except (ValueError, IndexError) as error:
         if str(error).startswith(str(line.path)):
             raise
-        raise ValueError(f"{line.where}: expected {kind} with its numbers, got {line.text[:60]!r}") from error
+        raise TorchCRFScanError(f"{line.where}: expected {kind} with its numbers, got {line.text[:60]!r}") from error
 
 
 def _read_fields(fields: list[str], family: str, line: Line) -> LaserLine:
@@ -70,11 +71,11 @@ def _read_fields(fields: list[str], family: str, line: Line) -> LaserLine:
         _, at = _counted(fields, at, line)  # remissions
     tail, poses = fields[at:], POSES[family]
     if len(tail) < poses + STAMPS:
-        raise ValueError(f"{line.where}: expected {poses + STAMPS} fields behind the ranges, got {len(tail)}")
+        raise TorchCRFScanError(f"{line.where}: expected {poses + STAMPS} fields behind the ranges, got {len(tail)}")
     numbers = np.array(tail[: min(poses, 6)], dtype=np.float64)
     stamps = np.array([tail[poses], tail[-1]], dtype=np.float64)
     if not np.isfinite(stamps).all():
-        raise ValueError(f"{line.where}: expected finite stamps, got {' '.join(tail)[:60]!r}")
+        raise TorchCRFScanError(f"{line.where}: expected finite stamps, got {' '.join(tail)[:60]!r}")
     first, second = (numbers[[k + 2, k, k + 1]] if poses and np.isfinite(numbers[k : k + 3]).all() else None for k in (0, 3))
     return LaserLine(ranges, start, step, limit, stamps, first, second)
 
@@ -97,7 +98,7 @@ def _counted(fields: list[str], at: int, line: Line) -> tuple[Floats, int]:
     check_beams(count, line.where)
     values = np.array(fields[at + 1 : at + 1 + max(count, 0)], dtype=np.float64)
     if len(values) != count:
-        raise ValueError(f"{line.where}: expected {count} numbers, got {len(values)}")
+        raise TorchCRFScanError(f"{line.where}: expected {count} numbers, got {len(values)}")
     return values, at + 1 + count
 
 

@@ -15,6 +15,7 @@ from torchcrf_scan.data.limits import MOST_SILENCE
 from torchcrf_scan.data.no_return import find_no_return
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.text_lines import Line, read_lines
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats
 
@@ -27,7 +28,7 @@ WORDS = {"RLASER": ("rearlaser", "rear_laser")}  # by which PARAM lines name the
 FRONT = ("frontlaser", "front_laser")
 
 
-class NotCarmenError(ValueError):
+class NotCarmenError(TorchCRFScanError):
     """A text without a single line of a laser."""
 
 
@@ -89,7 +90,7 @@ def _first_lines(path: Path, seen: _Seen, topic: str | None) -> Iterator[Line]:
             if scans >= SCANS or (scans > 0 and line.offset > ENOUGH):
                 return
             if not seen.kinds and line.offset > MOST_SILENCE:
-                raise ValueError(f"{path}: expected a scan within the first {MOST_SILENCE} bytes, got none")
+                raise TorchCRFScanError(f"{path}: expected a scan within the first {MOST_SILENCE} bytes, got none")
             yield line
     except ValueError:
         if not seen.kinds:
@@ -118,7 +119,7 @@ def _choose_kind(path: Path, kinds: Counter[str], topic: str | None) -> str:
     if topic is None:
         return next((kind for kind in PREFERRED if kind in kinds), min(kinds))
     if topic not in kinds:
-        raise ValueError(f"{path}: topic: expected one of {', '.join(sorted(kinds))}, got {topic}")
+        raise TorchCRFScanError(f"{path}: topic: expected one of {', '.join(sorted(kinds))}, got {topic}")
     return topic
 
 

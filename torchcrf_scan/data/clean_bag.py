@@ -15,6 +15,7 @@ import numpy as np
 
 from torchcrf_scan.data.ros_messages import CLOUD, LASER, ODOMETRY, TYPES, stamp_of
 from torchcrf_scan.data.spatial_covariance import spatial_covariance
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.result import ScanResult
 from torchcrf_scan.scan import Bools
 from torchcrf_scan.whole_file import whole_path
@@ -98,7 +99,7 @@ class _Copy:
                 odometry = odometry_message(self._types.types, message.header, result)
                 self._writer.write(self._odometry, stamp, self._bytes(self._types, odometry))
                 return
-        raise ValueError(
+        raise TorchCRFScanError(
             f"{self._reader.paths[0]}: expected the scan of {result.stamp:.6f} s on {self._topic}, got no such message"
         )
 

@@ -14,6 +14,7 @@ from torchcrf_scan.data.carmen_line import GEOMETRY, LaserLine, kind_of, read_la
 from torchcrf_scan.data.carmen_survey import Survey, survey
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.text_lines import GZIP, Line, read_lines
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.result import ScanResult
 from torchcrf_scan.scan import Bools
 from torchcrf_scan.whole_file import whole_file
@@ -52,7 +53,7 @@ def writing_clean_carmen(source: Path, target: Path, options: ReadOptions) -> It
                 elif (laser := _laser(line, known)) is not None and _is_scan_of(laser, known, result):
                     put(blank(line, laser, known, result.moving))
                     return
-            raise ValueError(f"{source}: expected the scan of {result.stamp:.6f} s, got no such line")
+            raise TorchCRFScanError(f"{source}: expected the scan of {result.stamp:.6f} s, got no such line")
 
         yield write
         for line in _until_fault(lines):

@@ -11,6 +11,7 @@ from torchcrf_scan.data.clean_carmen import writing_clean_carmen
 from torchcrf_scan.data.formats import find_format
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.text_lines import GZIP
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.result import ScanResult
 
 LOG = "clean.log"
@@ -29,7 +30,7 @@ def clean_name(source: Path) -> str:
             return f"{LOG}.gz" if file.read(len(GZIP)) == GZIP else LOG
     if form is not None and form.name in BAGS:
         return "clean.bag" if form.name == BAGS[0] else "clean"
-    raise ValueError(f"--clean: expected a {TEXT} or a bag, got {source}, a {'file' if form is None else form.name}")
+    raise TorchCRFScanError(f"--clean: expected a {TEXT} or a bag, got {source}, a {'file' if form is None else form.name}")
 
 
 def writing_clean(source: Path, target: Path, options: ReadOptions) -> AbstractContextManager[Callable[[ScanResult], None]]:

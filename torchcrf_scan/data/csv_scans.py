@@ -21,6 +21,7 @@ from torchcrf_scan.data.limits import check_beams
 from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.text_lines import Line, read_lines
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import Floats, Scan
 
 FIRST = "stamp"
@@ -38,7 +39,7 @@ def read_csv_scans(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iter
     lines = read_lines(Path(path))
     head = next(lines, None)
     if head is None:
-        raise ValueError(f"{path}: expected a row of column names, got an empty file")
+        raise TorchCRFScanError(f"{path}: expected a row of column names, got an empty file")
     has_odometry, bearings = _read_head(head)
     no_return = np.inf if options.no_return is None else options.no_return
     for line in lines:
@@ -59,9 +60,9 @@ def _read_head(line: Line) -> tuple[bool, Floats]:
         bearings = np.array(names, dtype=np.float64)
         Scan.from_ranges(np.zeros(len(bearings)), bearings)
     except ValueError as error:
-        raise ValueError(f"{line.where}: expected bearings of one turn in radians behind {FIRST}, got {error}") from error
+        raise TorchCRFScanError(f"{line.where}: expected bearings of one turn in radians behind {FIRST}, got {error}") from error
     if first != FIRST or not len(bearings):
-        raise ValueError(f"{line.where}: expected columns {FIRST} and bearings, got {line.text[:60]!r}")
+        raise TorchCRFScanError(f"{line.where}: expected columns {FIRST} and bearings, got {line.text[:60]!r}")
     return has_odometry, bearings
 
 
@@ -69,13 +70,13 @@ def _read_row(line: Line, has_odometry: bool, bearings: Floats, no_return: float
     fields = [field.strip() or "nan" for field in line.text.split(",")]
     ahead = 4 if has_odometry else 1
     if len(fields) != ahead + len(bearings):
-        raise ValueError(f"{line.where}: expected {ahead + len(bearings)} fields, got {len(fields)}")
+        raise TorchCRFScanError(f"{line.where}: expected {ahead + len(bearings)} fields, got {len(fields)}")
     try:
         values = np.array(fields, dtype=np.float64)
     except ValueError as error:
-        raise ValueError(f"{line.where}: expected numbers, got {error}") from error
+        raise TorchCRFScanError(f"{line.where}: expected numbers, got {error}") from error
     if not np.isfinite(values[0]):
-        raise ValueError(f"{line.where}: expected a finite stamp, got {line.text[:60]!r}")
+        raise TorchCRFScanError(f"{line.where}: expected a finite stamp, got {line.text[:60]!r}")
     ranges = np.where(values[ahead:] >= no_return, np.nan, values[ahead:])
     is_known = has_odometry and np.isfinite(values[1:4]).all()
     return Reading(Scan.from_ranges(ranges, bearings), float(values[0]), values[1:4] if is_known else None)

@@ -14,6 +14,7 @@ import numpy as np
 
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.ros2_bag import is_folder_bag
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import ScanPair
 
 
@@ -32,7 +33,7 @@ class PairFiles(Sequence[ScanPair]):
 
     def __init__(self, *patterns: str | Path) -> None:
         if not patterns:
-            raise ValueError("patterns: expected at least one file, folder or glob pattern, got none")
+            raise TorchCRFScanError("patterns: expected at least one file, folder or glob pattern, got none")
         self.paths: list[Path] = sorted({path for pattern in patterns for path in _matches(pattern)})
         self._read: dict[int, ScanPair] = {}
 
@@ -62,7 +63,7 @@ def _matches(pattern: str | Path) -> list[Path]:
     found = list(path.glob("*.npz")) if path.is_dir() else [Path(name) for name in glob.glob(str(path), recursive=True)]
     files = [file for file in found if file.is_file()]
     if not files:
-        raise ValueError(_missing(pattern, path))
+        raise TorchCRFScanError(_missing(pattern, path))
     return files
 
 
@@ -91,7 +92,7 @@ def split_by_sequence(pairs: Sequence[ScanPair], held_out: int | float, seed: in
     """
     sizes = Counter(pair.sequence for pair in pairs)
     if len(sizes) < 2:
-        raise ValueError(f"pairs: expected at least 2 sequences to split, got {len(sizes)}: {sorted(sizes)}")
+        raise TorchCRFScanError(f"pairs: expected at least 2 sequences to split, got {len(sizes)}: {sorted(sizes)}")
     names = sorted(sizes)
     order = [names[i] for i in np.random.default_rng(seed).permutation(len(names))]
     test_names = set(order[: _held_out_count([sizes[name] for name in order], held_out)])
@@ -104,9 +105,9 @@ def _held_out_count(sizes: list[int], held_out: int | float) -> int:
     """Number of recordings, in this order, that are held out; always between 1 and all but one."""
     if isinstance(held_out, int | np.integer) and not isinstance(held_out, bool):
         if not 1 <= held_out < len(sizes):
-            raise ValueError(f"held_out: expected a number of sequences in [1, {len(sizes) - 1}], got {held_out}")
+            raise TorchCRFScanError(f"held_out: expected a number of sequences in [1, {len(sizes) - 1}], got {held_out}")
         return int(held_out)
     if isinstance(held_out, bool) or not 0 < held_out < 1:
-        raise ValueError(f"held_out: expected a number of sequences or a share in (0, 1), got {held_out}")
+        raise TorchCRFScanError(f"held_out: expected a number of sequences or a share in (0, 1), got {held_out}")
     wanted = math.ceil(held_out * sum(sizes) - 1e-9)
     return min(int(np.searchsorted(np.cumsum(sizes), wanted)) + 1, len(sizes) - 1)

@@ -13,6 +13,7 @@ from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.simulate import simulate_sequence
 from torchcrf_scan.data.world import Mover
 from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import OUTLIER, Bools, Floats, Ints, Scan
 
@@ -110,9 +111,9 @@ def simulate_drive(config: SimulatorConfig, scans: int, seed: int) -> Drive:
         ValueError: fewer than two scans, or a negative seed.
     """
     if scans < 2:
-        raise ValueError(f"scans: expected at least 2, got {scans}")
+        raise TorchCRFScanError(f"scans: expected at least 2, got {scans}")
     if seed < 0:
-        raise ValueError(f"seed: expected at least 0, got {seed}")
+        raise TorchCRFScanError(f"seed: expected at least 0, got {seed}")
     patience = round(PATIENCE / config.dt)
     captures = simulate_sequence(config, scans - 1, np.random.default_rng([seed, 0]), patience)
     to_first = se2.inverse(captures[0].ego)

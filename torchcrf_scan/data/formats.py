@@ -19,6 +19,7 @@ from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.recording import Recording
 from torchcrf_scan.data.ros_bag import read_folder_bag, read_mcap, read_ros1_bag, read_sqlite_bag
 from torchcrf_scan.data.text_lines import open_unpacked
+from torchcrf_scan.errors import TorchCRFScanError
 
 HEAD = 512  # bytes
 STARTS = (ZIP, ros1_bag.MAGIC, mcap_bag.MAGIC, ros2_bag.SQLITE)
@@ -46,7 +47,7 @@ class Format:
         for name in ("topic", "odometry", "no_return"):
             value = getattr(options, name)
             if name not in self.options and value not in (None, AUTO):
-                raise ValueError(f"{path}: {name}: expected none, as this is a {self.name}, got {value}")
+                raise TorchCRFScanError(f"{path}: {name}: expected none, as this is a {self.name}, got {value}")
 
 
 def _begins(start: bytes) -> Callable[[bytes], bool]:
@@ -66,7 +67,7 @@ def _read_text(path: Path, options: ReadOptions) -> Iterator[Reading]:
     try:
         yield from read_carmen(path, options)
     except NotCarmenError as error:
-        raise ValueError(f"{path}: expected one of {NAMES}, got another text ({error})") from error
+        raise TorchCRFScanError(f"{path}: expected one of {NAMES}, got another text ({error})") from error
 
 
 PAIR = Format("pair file", _begins(ZIP), read_pair_scans, ())
@@ -143,7 +144,7 @@ def _ignore(error: ValueError) -> None:
 def _reader(path: str | Path, options: ReadOptions) -> Reader:
     form = find_format(path)
     if form is None:
-        raise ValueError(f"{path}: expected one of {NAMES}, got {_unknown(Path(path))}")
+        raise TorchCRFScanError(f"{path}: expected one of {NAMES}, got {_unknown(Path(path))}")
     form.check(path, options)
     return form.read
 

@@ -13,6 +13,7 @@ from typing import BinaryIO
 
 from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, type_name, unpack
 from torchcrf_scan.data.limits import MOST_CHUNK
+from torchcrf_scan.errors import TorchCRFScanError
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
@@ -68,7 +69,7 @@ class McapBag:
                 raise self._fault(file, error) from error
 
     def _fault(self, file: BinaryIO, error: Exception) -> ValueError:
-        return ValueError(f"{self.path}, byte {file.tell()}: expected a whole record of MCAP, got {error}")
+        return TorchCRFScanError(f"{self.path}, byte {file.tell()}: expected a whole record of MCAP, got {error}")
 
 
 class _Channels:
@@ -99,8 +100,9 @@ def _walk(file: BinaryIO, start: int, found: _Channels) -> Iterator[tuple[Topic,
         if kind in (DATA_END, FOOTER):
             return
         if kind == CHUNK:
-            inner = io.BytesIO(_unpack(data))
-            while inner.tell() < len(inner.getbuffer()):
+            records = _unpack(data)
+            inner = io.BytesIO(records)
+            while inner.tell() < len(records):
                 yield from _read_message(*_read_record(inner), found, offset)
         else:
             yield from _read_message(kind, data, found, offset)
@@ -118,7 +120,7 @@ def _read_record(file: BinaryIO) -> tuple[int, bytes]:
     head = _exactly(file, 9)
     size = int(struct.unpack("<Q", head[1:])[0])
     if size > MOST_CHUNK:
-        raise ValueError(f"expected records of at most {MOST_CHUNK} bytes, got {size}")
+        raise TorchCRFScanError(f"expected records of at most {MOST_CHUNK} bytes, got {size}")
     return head[0], _exactly(file, size)
 
 

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
+from torchcrf_scan.errors import TorchCRFScanError
+
 Made = TypeVar("Made")
 
 AUTO = "auto"  # the only topic with odometry
@@ -32,7 +34,7 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         if self.no_return is not None and not self.no_return > 0:
-            raise ValueError(f"no_return: expected metres above 0, got {self.no_return}")
+            raise TorchCRFScanError(f"no_return: expected metres above 0, got {self.no_return}")
 
     def attempt(self, make: Callable[[], Made]) -> Made | None:
         """What `make` makes of a line or message; None if that is malformed and left out, else its ValueError is raised."""

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcrf_scan.data.archive import read_arrays
-from torchcrf_scan.data.limits import MOST_BEAMS
 from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
 from torchcrf_scan.data.reading import Reading
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, Scan, ScanPair, check_sensor
 from torchcrf_scan.whole_file import whole_file
 
@@ -53,7 +53,7 @@ class _Fields:
         return key in self.arrays
 
     def fail(self, key: str, expected: str, got: object) -> NoReturn:
-        raise ValueError(f"{self.path}: {key}: expected {expected}, got {got}")
+        raise TorchCRFScanError(f"{self.path}: {key}: expected {expected}, got {got}")
 
     def get(self, key: str, kind: str, *shape: int | str) -> NDArray[Any]:
         """The array `key` of a given kind of number and shape (a name fits any length), converted to the package's dtype."""
@@ -75,12 +75,10 @@ class _Fields:
             where = tuple(int(i) for i in wrong[0])
             self.fail(key, expected, f"{values[where]}" + (f" at index {', '.join(map(str, where))}" if where else ""))
 
-    def number(self, key: str, *, above: float | None = None, at_least: float | None = None) -> float:
-        """A finite number, greater than `above` or not less than `at_least`."""
+    def number(self, key: str) -> float:
+        """A finite number of at least 0."""
         value = self.get(key, "float")
-        low = -np.inf if at_least is None else at_least
-        expected = f"a finite number {'above' if at_least is None else 'of at least'} {above if at_least is None else at_least}"
-        self.require(key, value, np.isfinite(value) & (value >= low) & (above is None or value > above), expected)
+        self.require(key, value, np.isfinite(value) & (value >= 0), "a finite number of at least 0.0")
         return float(value)
 
     def motions(self) -> Floats:
@@ -163,32 +161,33 @@ def write_prediction(path: str | Path, prediction: PairPrediction) -> None:
 def _parse_pair(fields: _Fields) -> ScanPair:
     sensor = _parse_sensor(fields)
     source, target = (_parse_scan(fields, side, sensor) for side in ("source", "target"))
-    dt = fields.number("dt", above=0.0)
+    dt = fields.number("dt")
     sequence, origin = (str(fields.get(key, "str")) if key in fields else "" for key in _TEXT_KEYS)
     annotation = _parse_annotation(fields, source, target)
-    return ScanPair(source, target, dt, annotation, sequence, fields.path.stem, origin)
+    try:
+        return ScanPair(source, target, dt, annotation, sequence, fields.path.stem, origin)
+    except ValueError as error:
+        raise TorchCRFScanError(f"{fields.path}: {error}") from error
 
 
 def _parse_sensor(fields: _Fields) -> dict[str, float | None]:
-    sensor = {key: fields.number(key, at_least=0.0) if key in fields else None for key in _SENSOR_KEYS}
+    sensor = {key: fields.number(key) if key in fields else None for key in _SENSOR_KEYS}
     try:
         check_sensor(**sensor)
     except ValueError as error:
-        raise ValueError(f"{fields.path}: {error}") from error
+        raise TorchCRFScanError(f"{fields.path}: {error}") from error
     return sensor
 
 
 def _parse_scan(fields: _Fields, side: str, sensor: dict[str, float | None]) -> Scan:
     ranges = fields.get(f"{side}_ranges", "float", "N" if side == "source" else "M")
-    if len(ranges) > MOST_BEAMS:
-        fields.fail(f"{side}_ranges", f"at most {MOST_BEAMS} beams", len(ranges))
     key = f"{side}_bearings"
     bearings = fields.get(key, "float", len(ranges))
     fields.require(key, bearings, np.isfinite(bearings), "finite bearings")
     try:
         return Scan.from_ranges(ranges, bearings, **sensor)
     except ValueError as error:
-        raise ValueError(f"{fields.path}: {side}_{error}") from error
+        raise TorchCRFScanError(f"{fields.path}: {side}_{error}") from error
 
 
 def _parse_annotation(fields: _Fields, source: Scan, target: Scan) -> Annotation | None:
@@ -257,7 +256,7 @@ def _pair_arrays(path: Path, pair: ScanPair) -> dict[str, NDArray[Any]]:
     for key in _SENSOR_KEYS:
         value, other = getattr(pair.source, key), getattr(pair.target, key)
         if value != other:
-            raise ValueError(f"{path}: {key}: expected the same of both scans, got {value} and {other}")
+            raise TorchCRFScanError(f"{path}: {key}: expected the same of both scans, got {value} and {other}")
         if value is not None:
             arrays[key] = np.float64(value)
     arrays |= {key: text for key, text in (("sequence", pair.sequence), ("source", pair.origin)) if text}

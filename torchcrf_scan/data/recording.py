@@ -12,6 +12,7 @@ import numpy as np
 
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.stamps import steps_with_a_word
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats, ScanPair
 
@@ -63,7 +64,7 @@ class Recording(Sequence[ScanPair]):
             self.fault = error
             logger.warning("%s; the %d scans before that are read", error, len(stamps))
         if len(stamps) < 2:
-            raise ValueError(f"{self.path}: expected at least two scans, got {['none', 'one'][len(stamps)]}")
+            raise TorchCRFScanError(f"{self.path}: expected at least two scans, got {['none', 'one'][len(stamps)]}")
         return np.array(stamps), odometry
 
     def __len__(self) -> int:

@@ -13,6 +13,7 @@ from typing import BinaryIO
 
 from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, type_name, unpack
 from torchcrf_scan.data.limits import MOST_CHUNK
+from torchcrf_scan.errors import TorchCRFScanError
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = range(2, 8)
@@ -45,7 +46,7 @@ class Ros1Bag:
         fields, _ = _read_record(file)
         (position,) = struct.unpack("<Q", fields[b"index_pos"])
         if position == 0:
-            raise ValueError("expected an index, got none")
+            raise TorchCRFScanError("expected an index, got none")
         return int(position)
 
     def _search(self, file: BinaryIO, connections: dict[int, Topic]) -> None:
@@ -73,7 +74,7 @@ class Ros1Bag:
                 raise self._fault(file, error) from error
 
     def _fault(self, file: BinaryIO, error: Exception) -> ValueError:
-        return ValueError(f"{self.path}, byte {file.tell()}: expected a whole record of a bag, got {error}")
+        return TorchCRFScanError(f"{self.path}, byte {file.tell()}: expected a whole record of a bag, got {error}")
 
 
 def _walk(
@@ -126,7 +127,7 @@ def _sized(file: BinaryIO) -> bytes:
     """Bytes behind their number."""
     (size,) = struct.unpack("<L", _exactly(file, 4))
     if size > MOST_CHUNK:
-        raise ValueError(f"expected at most {MOST_CHUNK} bytes, got {size}")
+        raise TorchCRFScanError(f"expected at most {MOST_CHUNK} bytes, got {size}")
     return _exactly(file, size)
 
 

@@ -11,7 +11,10 @@ from typing import TYPE_CHECKING
 import yaml
 
 from torchcrf_scan.data.bag_records import Bag, Message, Topic
+from torchcrf_scan.data.bounded_yaml import read_yaml
+from torchcrf_scan.data.limits import MOST_CHUNK
 from torchcrf_scan.data.mcap_bag import MAGIC, McapBag
+from torchcrf_scan.errors import TorchCRFScanError
 
 if TYPE_CHECKING:
     import sqlite3
@@ -30,16 +33,20 @@ class SqliteBag:
     def _open(self) -> closing[sqlite3.Connection]:
         import sqlite3  # some Pythons have none
 
-        return closing(sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True))
+        base = sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+        base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_CHUNK)
+        return closing(base)
 
     def topics(self) -> list[Topic]:
         """The topics of the database. Raises ValueError if it cannot be read."""
         with self._open() as base:
             try:
+                _check_tables(base)
                 definitions = self._definitions(base)
-                rows = base.execute("SELECT name, type FROM topics ORDER BY id").fetchall()
-            except base.Error as error:
-                raise ValueError(f"{self.path}: expected a database with topics, got {error}") from error
+                known = "SELECT CAST(name AS TEXT), CAST(type AS TEXT) FROM topics WHERE name NOTNULL AND type NOTNULL ORDER BY id"
+                rows = base.execute(known).fetchall()
+            except (base.Error, ValueError, AttributeError) as error:
+                raise TorchCRFScanError(f"{self.path}: expected a database with topics, got {error}") from error
         return [Topic(name, kind, *definitions.get(kind, ("", False))) for name, kind in rows]
 
     def _definitions(self, base: sqlite3.Connection) -> dict[str, tuple[str, bool]]:
@@ -56,15 +63,23 @@ class SqliteBag:
             ValueError: a damaged or cut database, with the row, after all messages before it.
         """
         topics = {topic.name: topic for topic in self.topics()}
-        query = "SELECT messages.id, name, timestamp, data FROM messages JOIN topics ON topics.id = topic_id ORDER BY messages.id"
+        stored = "messages.id, CAST(name AS TEXT), CAST(timestamp AS INTEGER), CAST(data AS BLOB)"
+        query = f"SELECT {stored} FROM messages JOIN topics ON topics.id = topic_id ORDER BY messages.id"
         row = 0
         with self._open() as base:
             try:
                 for row, name, stamp, data in base.execute(query):
                     if name in names:
                         yield Message(topics[name], 1e-9 * stamp, data, f"{self.path}, row {row}")
-            except base.Error as error:
-                raise ValueError(f"{self.path}, behind row {row}: expected a whole database, got {error}") from error
+            except (base.Error, TypeError) as error:
+                raise TorchCRFScanError(f"{self.path}, behind row {row}: expected a whole database, got {error}") from error
+
+
+def _check_tables(base: sqlite3.Connection) -> None:
+    """Raises ValueError for views and triggers: a bag has none, and they may compute for ever."""
+    found = base.execute("SELECT name FROM sqlite_master WHERE type NOT IN ('table', 'index')").fetchone()
+    if found:
+        raise TorchCRFScanError(f"the view or trigger {found[0]!r}")
 
 
 class FolderBag:
@@ -78,7 +93,7 @@ class FolderBag:
         self.path = path
         names, mode = _listed(path) if (path / METADATA).is_file() else (sorted(file.name for file in _bags_in(path)), "none")
         if mode not in ("none", "", "message"):
-            raise ValueError(f"{path}: expected messages packed one by one or not at all, got files packed by {mode}")
+            raise TorchCRFScanError(f"{path}: expected messages packed one by one or not at all, got files packed by {mode}")
         self._is_packed = mode == "message"
         self._parts = [_part(path / name) for name in names]
 
@@ -101,10 +116,10 @@ def is_folder_bag(path: Path) -> bool:
 def _listed(path: Path) -> tuple[list[str], str]:
     """Files and kind of packing by the metadata of a folder."""
     try:
-        told = yaml.safe_load((path / METADATA).read_text())["rosbag2_bagfile_information"]
+        told = read_yaml(path / METADATA)["rosbag2_bagfile_information"]
         return [PurePath(name).name for name in told["relative_file_paths"]], (told.get("compression_mode") or "none").lower()
-    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path / METADATA}: expected a list of files, got {type(error).__name__}: {error}") from error
+    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError) as error:
+        raise TorchCRFScanError(f"{path / METADATA}: expected a list of files, got {type(error).__name__}: {error}") from error
 
 
 def _bags_in(path: Path) -> Iterator[Path]:
@@ -116,9 +131,9 @@ def _part(path: Path) -> Bag:
         with open(path, "rb") as file:
             head = file.read(len(SQLITE))
     except OSError as error:
-        raise ValueError(f"{path}: expected the file that {METADATA} lists, got {error}") from error
+        raise TorchCRFScanError(f"{path}: expected the file that {METADATA} lists, got {error}") from error
     if head.startswith(MAGIC):
         return McapBag(path)
     if head == SQLITE:
         return SqliteBag(path)
-    raise ValueError(f"{path}: expected a database of SQLite or MCAP, got another format")
+    raise TorchCRFScanError(f"{path}: expected a database of SQLite or MCAP, got another format")

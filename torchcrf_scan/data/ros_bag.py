@@ -16,6 +16,7 @@ from torchcrf_scan.data.ros1_bag import Ros1Bag
 from torchcrf_scan.data.ros2_bag import FolderBag, SqliteBag
 from torchcrf_scan.data.ros_messages import CLOUD, LASER, ODOMETRY, OLD_TRANSFORMS, SCANS, TRANSFORMS, stamp_of
 from torchcrf_scan.data.ros_odometry import OdometryBeside
+from torchcrf_scan.errors import TorchCRFScanError
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -80,11 +81,11 @@ def _choose(path: Path, topics: list[Topic], types: tuple[str, ...], name: str |
     fits = [topic for topic in topics if topic.type in types]
     if not fits:
         wanted = " or ".join(kind.replace("/msg/", "/") for kind in types)
-        raise ValueError(f"{path}: {option}: expected a topic of type {wanted}, got {_listed(topics) or 'none'}")
+        raise TorchCRFScanError(f"{path}: {option}: expected a topic of type {wanted}, got {_listed(topics) or 'none'}")
     chosen = [topic for topic in fits if name is None or topic.name.strip("/") == name.strip("/")]
     if len(chosen) == 1:
         return chosen[0]
-    raise ValueError(f"{path}: {option}: expected {'one' if name else 'which'} of {_listed(fits)}, got {name or 'none'}")
+    raise TorchCRFScanError(f"{path}: {option}: expected {'one' if name else 'which'} of {_listed(fits)}, got {name or 'none'}")
 
 
 def _listed(topics: list[Topic]) -> str:
@@ -105,7 +106,9 @@ class _Reader:
             deserialize = self._store.deserialize_cdr if message.topic.is_cdr else self._store.deserialize_ros1
             return deserialize(data, message.topic.type)
         except Exception as error:  # a library's, of damaged bytes
-            raise ValueError(f"{message.where}: expected a {message.topic.type}, got {type(error).__name__}: {error}") from error
+            raise TorchCRFScanError(
+                f"{message.where}: expected a {message.topic.type}, got {type(error).__name__}: {error}"
+            ) from error
 
     def scan(self, message: Message) -> tuple[Reading, str]:
         """The scan of a message, and the frame it is in."""
@@ -113,7 +116,7 @@ class _Reader:
         try:
             scan = self._scan_of(told, self._no_return)
         except (ValueError, TypeError, KeyError) as error:
-            raise ValueError(f"{message.where}, {message.topic.name}: {error}") from error
+            raise TorchCRFScanError(f"{message.where}, {message.topic.name}: {error}") from error
         return Reading(scan, stamp_of(told.header) or message.stamp), told.header.frame_id
 
 
@@ -144,13 +147,16 @@ def _typestore(bag: Bag, topics: list[Topic], is_cdr: bool) -> Typestore:
     try:
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     except ImportError as error:
-        raise ValueError(f"{bag.path}: expected the library rosbags, which reads bags (extra `ros`), got {error}") from error
+        raise TorchCRFScanError(f"{bag.path}: expected the library rosbags, which reads bags (extra `ros`), got {error}") from error
     store = get_typestore(Stores.LATEST if is_cdr else Stores.ROS1_NOETIC)
     wanted = (LASER, CLOUD, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
     found: dict[str, Any] = {}
-    for topic in topics:
-        if topic.type in wanted and topic.type not in store.fielddefs and topic.definition:
-            parse = get_types_from_idl(topic.definition) if topic.is_idl else get_types_from_msg(topic.definition, topic.type)
-            found |= {name: definition for name, definition in parse.items() if name not in store.fielddefs}
-    store.register(found)
+    try:
+        for topic in topics:
+            if topic.type in wanted and topic.type not in store.fielddefs and topic.definition:
+                parse = get_types_from_idl(topic.definition) if topic.is_idl else get_types_from_msg(topic.definition, topic.type)
+                found |= {name: definition for name, definition in parse.items() if name not in store.fielddefs}
+        store.register(found)
+    except Exception as error:  # a library's, of damaged definitions
+        raise TorchCRFScanError(f"{bag.path}: expected definitions of types, got {type(error).__name__}: {error}") from error
     return store

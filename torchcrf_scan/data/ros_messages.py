@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchcrf_scan.data.limits import check_beams
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import Floats, Scan
 
 LASER, CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
@@ -18,7 +19,6 @@ OLD_TRANSFORMS = "tf/msg/tfMessage"
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of sensor_msgs/PointField
 TIMES = {"t": 1e-9, "time": 1.0, "timestamp": 1.0, "time_offset": 1.0}  # names of a point's time, and its unit if it is a fraction
 PLANAR, OUTLYING = 0.1, 0.02  # metres from the plane, and the share of points that may be farther
-FARTHEST_START = 4 * math.pi  # radians; a first bearing beyond is no angle of a laser
 UPRIGHT = 0.98  # cosine of the greatest tilt of a planar mount
 
 
@@ -36,8 +36,6 @@ def laser_scan(message: Any, no_return: float) -> Scan:
     count = len(ranges)
     check_beams(count, "ranges")
     first, step = float(message.angle_min), float(message.angle_increment)
-    if abs(first) > FARTHEST_START:
-        raise ValueError(f"angle_min: expected radians within two turns, got {first}")
     if step == 0 and count > 1:
         step = (float(message.angle_max) - first) / (count - 1)
     least, most, between = float(message.range_min), float(message.range_max), float(message.time_increment)
@@ -60,7 +58,7 @@ def cloud_scan(message: Any, no_return: float) -> Scan:
     points = _points(message)
     names = points.dtype.names or ()
     if not {"x", "y"} <= set(names):
-        raise ValueError(f"expected a cloud with x and y, got {', '.join(names)}")
+        raise TorchCRFScanError(f"expected a cloud with x and y, got {', '.join(names)}")
     x, y = (points[name].astype(np.float64) for name in ("x", "y"))
     with np.errstate(invalid="ignore"):
         ranges = np.hypot(x, y)
@@ -69,7 +67,7 @@ def cloud_scan(message: Any, no_return: float) -> Scan:
         height = points["z"][seen]
         far = np.abs(height - np.median(height)) > PLANAR
         if far.mean() > OUTLYING:
-            raise ValueError(f"expected a planar cloud, got heights from {height.min():.2f} to {height.max():.2f} m")
+            raise TorchCRFScanError(f"expected a planar cloud, got heights from {height.min():.2f} to {height.max():.2f} m")
     bearings = np.where(seen, np.arctan2(y, x), 0.0)
     return Scan.from_ranges(np.where(ranges < no_return, ranges, np.nan), bearings, times=_times(points))
 

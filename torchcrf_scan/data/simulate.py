@@ -15,6 +15,7 @@ from torchcrf_scan.data.annotate import STATIC, Capture, annotate
 from torchcrf_scan.data.laser import Hits, beam_bearings, cast, in_view, measure
 from torchcrf_scan.data.world import Mover, Shapes, Viewer, World, draw_mover, indoor, littered, street
 from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Bools, Floats, Ints, ScanPair
 
@@ -218,11 +219,11 @@ def simulate_pairs(config: SimulatorConfig, pairs: int, sequences: int, seed: in
         ValueError: fewer than one pair, no drive or more drives than pairs, a negative seed.
     """
     if pairs < 1:
-        raise ValueError(f"pairs: expected at least 1, got {pairs}")
+        raise TorchCRFScanError(f"pairs: expected at least 1, got {pairs}")
     if not 1 <= sequences <= pairs:
-        raise ValueError(f"sequences: expected 1 to pairs = {pairs}, got {sequences}")
+        raise TorchCRFScanError(f"sequences: expected 1 to pairs = {pairs}, got {sequences}")
     if seed < 0:
-        raise ValueError(f"seed: expected at least 0, got {seed}")
+        raise TorchCRFScanError(f"seed: expected at least 0, got {seed}")
     simulated = []
     for s in range(sequences):
         length = pairs // sequences + (s < pairs % sequences)

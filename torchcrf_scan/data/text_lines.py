@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from torchcrf_scan.data.limits import MOST_LINE
+from torchcrf_scan.errors import TorchCRFScanError
 
 GZIP = b"\x1f\x8b"
 
@@ -60,9 +61,9 @@ def _next_line(file: IO[bytes], path: Path, number: int, offset: int) -> bytes:
     try:
         raw = file.readline(MOST_LINE + 1)
     except (OSError, EOFError, zlib.error) as error:
-        raise ValueError(f"{where}: expected a whole file, got {error}") from error
+        raise TorchCRFScanError(f"{where}: expected a whole file, got {error}") from error
     if len(raw) > MOST_LINE:
-        raise ValueError(f"{where}: expected lines of at most {MOST_LINE} bytes, got a longer one")
+        raise TorchCRFScanError(f"{where}: expected lines of at most {MOST_LINE} bytes, got a longer one")
     if b"\0" in raw:
-        raise ValueError(f"{where}: expected text, got binary data")
+        raise TorchCRFScanError(f"{where}: expected text, got binary data")
     return raw

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.result import MovingObject
 from torchcrf_scan.scan import Floats, Ints
 from torchcrf_scan.whole_file import whole_file
@@ -80,12 +81,12 @@ def read_tracks(path: str | Path) -> TrackTable:
     try:
         text = Path(path).read_text(encoding="utf-8")
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: expected a CSV file of tracks, got other bytes") from None
+        raise TorchCRFScanError(f"{path}: expected a CSV file of tracks, got other bytes") from None
     lines = csv.reader(StringIO(text, newline=""))
     header = next(lines, [])
     missing = [name for name in COLUMNS if name not in header]
     if missing:
-        raise ValueError(f"{path}, line 1: expected the columns {', '.join(COLUMNS)}, got none named {', '.join(missing)}")
+        raise TorchCRFScanError(f"{path}, line 1: expected the columns {', '.join(COLUMNS)}, got none named {', '.join(missing)}")
     places = [header.index(name) for name in COLUMNS]
     rows = [_fields(line, places, f"{path}, line {lines.line_num}") for line in lines if line]
     table = np.array(rows, dtype=np.float64).reshape(-1, len(COLUMNS))
@@ -96,7 +97,7 @@ def read_tracks(path: str | Path) -> TrackTable:
 def _fields(line: list[str], places: list[int], where: str) -> list[float | int]:
     """The numbers of one line, in the order of `COLUMNS`."""
     if len(line) <= max(places):
-        raise ValueError(f"{where}: expected at least {max(places) + 1} fields, got {len(line)}")
+        raise TorchCRFScanError(f"{where}: expected at least {max(places) + 1} fields, got {len(line)}")
     fields: list[float | int] = []
     for name, place in zip(COLUMNS, places, strict=True):
         kind = int if name in WHOLE else float
@@ -105,6 +106,8 @@ def _fields(line: list[str], places: list[int], where: str) -> list[float | int]
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise ValueError(f"{where}: {name}: expected a {'whole' if kind is int else 'finite'} number, got {line[place]!r}")
+            raise TorchCRFScanError(
+                f"{where}: {name}: expected a {'whole' if kind is int else 'finite'} number, got {line[place]!r}"
+            )
         fields.append(value)
     return fields

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import Floats
 from torchcrf_scan.whole_file import whole_file
 
@@ -71,7 +72,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: expected lines of text, got other bytes") from None
+        raise TorchCRFScanError(f"{path}: expected lines of text, got other bytes") from None
     rows = [_row(line, f"{path}, line {number}") for number, line in enumerate(lines, 1) if line.partition("#")[0].strip()]
     table = np.array(rows, dtype=np.float64).reshape(-1, FIELDS)
     theta = 2 * np.arctan2(table[:, 6], table[:, 7])
@@ -87,7 +88,7 @@ def _row(line: str, where: str) -> list[float]:
     except ValueError:
         row = []
     if len(row) != FIELDS or not np.isfinite(row).all():
-        raise ValueError(f"{where}: expected eight finite numbers (stamp x y z qx qy qz qw), got {line.strip()[:80]!r}")
+        raise TorchCRFScanError(f"{where}: expected eight finite numbers (stamp x y z qx qy qz qw), got {line.strip()[:80]!r}")
     if np.hypot(row[4], row[5]) > TILT * np.hypot(row[6], row[7]):
-        raise ValueError(f"{where}: expected a rotation about z, got the quaternion {tuple(row[4:])}")
+        raise TorchCRFScanError(f"{where}: expected a rotation about z, got the quaternion {tuple(row[4:])}")
     return row

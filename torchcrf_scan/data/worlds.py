@@ -6,7 +6,9 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated
 
+from torchcrf_scan.beams import MOST_BEAMS
 from torchcrf_scan.checks import Amount, OneOf, Positive, Share, Within, check_fields
+from torchcrf_scan.errors import TorchCRFScanError
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class SimulatorConfig:
     """
 
     scene: Annotated[str, OneOf("street", "indoor")] = "street"
-    beams: Annotated[int, Within(1, 100_000)] = 361
+    beams: Annotated[int, Within(1, MOST_BEAMS)] = 361
     fov: Annotated[float, Within(0, 360, above=True)] = 180.0
     range_min: Amount = 0.1
     range_max: Annotated[float, Within(0, 1e6, above=True)] = 80.0
@@ -70,9 +72,9 @@ class SimulatorConfig:
     def __post_init__(self) -> None:
         check_fields(self)
         if self.range_max <= self.range_min:
-            raise ValueError(f"range_max: expected more than range_min = {self.range_min}, got {self.range_max}")
+            raise TorchCRFScanError(f"range_max: expected more than range_min = {self.range_min}, got {self.range_max}")
         if self.movers_max < self.movers_min:
-            raise ValueError(f"movers_max: expected at least movers_min = {self.movers_min}, got {self.movers_max}")
+            raise TorchCRFScanError(f"movers_max: expected at least movers_min = {self.movers_min}, got {self.movers_max}")
 
 
 MODEL_CARS = SimulatorConfig(beams=360, fov=360.0, range_max=9.0, dropout=0.3, scale=0.1, ego_translation=4.0, ego_rotation=0.25)

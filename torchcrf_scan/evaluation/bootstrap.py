@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.measures import Count
 from torchcrf_scan.evaluation.metrics import LabelScore, PairScore
 from torchcrf_scan.evaluation.summary import EGO_ROTATION, EGO_TRANSLATION, correct_errors
@@ -138,7 +139,7 @@ def paired_intervals(ours: Sequence[PairScore], theirs: Sequence[PairScore], wei
 def _over_all(scores: Sequence[PairScore], weights: Ints) -> tuple[Floats, Floats]:
     """(F,) the ratios over all pairs, and (R, F) over every resample."""
     if weights.ndim != 2 or weights.shape[1] != len(scores) or not len(weights):
-        raise ValueError(f"weights: expected shape (resamples, {len(scores)}), got {weights.shape}")
+        raise TorchCRFScanError(f"weights: expected shape (resamples, {len(scores)}), got {weights.shape}")
     return _figures(scores, np.ones((1, len(scores)), dtype=np.int64))[0], _figures(scores, weights)
 
 
@@ -231,15 +232,15 @@ def _counts(drawn: Ints, number: int) -> Ints:
 def _check_positive(**numbers: int) -> None:
     for name, number in numbers.items():
         if number < 1:
-            raise ValueError(f"{name}: expected at least 1, got {number}")
+            raise TorchCRFScanError(f"{name}: expected at least 1, got {number}")
 
 
 def _check_same_pairs(ours: Sequence[PairScore], theirs: Sequence[PairScore]) -> None:
     if not ours:
-        raise ValueError("ours: expected at least one pair, got none")
+        raise TorchCRFScanError("ours: expected at least one pair, got none")
     if len(ours) != len(theirs):
-        raise ValueError(f"theirs: expected the {len(ours)} pairs of `ours`, got {len(theirs)}")
+        raise TorchCRFScanError(f"theirs: expected the {len(ours)} pairs of `ours`, got {len(theirs)}")
     for i, (our, their) in enumerate(zip(ours, theirs, strict=True)):
         if (our.sequence, our.name) != (their.sequence, their.name):
             expected, got = f"{our.name!r} of {our.sequence!r}", f"{their.name!r} of {their.sequence!r}"
-            raise ValueError(f"theirs: expected the pairs of `ours` in the same order, at {i} {expected}, got {got}")
+            raise TorchCRFScanError(f"theirs: expected the pairs of `ours` in the same order, at {i} {expected}, got {got}")

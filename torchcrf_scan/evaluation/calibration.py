@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri  # quantiles of chi-square; `scipy.stats` takes a second to import
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers, relabel
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, Bools, Floats, PairPrediction, ScanPair
@@ -44,11 +45,11 @@ def reliability(confidence: ArrayLike, is_right: ArrayLike, bins: int = BINS) ->
     """
     confidences, right = np.asarray(confidence, dtype=np.float64), np.asarray(is_right, dtype=bool)
     if confidences.ndim != 1 or confidences.shape != right.shape:
-        raise ValueError(f"is_right: expected one for every confidence (P,), got {right.shape} for {confidences.shape}")
+        raise TorchCRFScanError(f"is_right: expected one for every confidence (P,), got {right.shape} for {confidences.shape}")
     if not ((confidences >= 0) & (confidences <= 1)).all():
-        raise ValueError("confidence: expected numbers in [0, 1], got others")
+        raise TorchCRFScanError("confidence: expected numbers in [0, 1], got others")
     if bins < 1:
-        raise ValueError(f"bins: expected at least 1, got {bins}")
+        raise TorchCRFScanError(f"bins: expected at least 1, got {bins}")
     place = np.minimum((confidences * bins).astype(np.int64), bins - 1)
     edges = np.linspace(0.0, 1.0, bins + 1)
     table = []
@@ -103,7 +104,7 @@ def consistency(nees: ArrayLike, freedom: int = MOTION_FREEDOM, level: float = 0
     """Compares normalised errors (P,) with the chi-square distribution. Raises ValueError for empty input."""
     values = np.asarray(nees, dtype=np.float64)
     if values.ndim != 1 or not len(values):
-        raise ValueError(f"nees: expected at least one number (P,), got {values.shape}")
+        raise TorchCRFScanError(f"nees: expected at least one number (P,), got {values.shape}")
     n = len(values)
     low, high = chdtri(n * freedom, np.array([1 + level, 1 - level]) / 2) / n
     return Consistency(
@@ -136,7 +137,7 @@ class Rightness:
 def rightness(pair: ScanPair, prediction: PairPrediction, tolerance: int = 2) -> Rightness:
     """Compares a prediction with the pair's annotation. Raises ValueError for a pair without one."""
     if pair.annotation is None:
-        raise ValueError(f"pair {pair.name!r}: expected an annotation, got none")
+        raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
     beam = pair.source.beam
     known = ~pair.annotation.ignore[beam]
     truth, answer = pair.annotation.association[beam], prediction.association[beam]

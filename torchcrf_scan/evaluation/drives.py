@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchcrf_scan.data.drive import Drive, DriveScan
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.metrics import FOUND_IOU, MOVER_MIN_POINTS
 from torchcrf_scan.evaluation.tracking import TrackFrame, frame_of_points, frame_of_positions, track_scores
 from torchcrf_scan.evaluation.trajectory import relative_error
@@ -35,7 +36,7 @@ def drive_scores(drives: Sequence[Drive], results: Sequence[Sequence[ScanResult]
         ValueError: no drives, or another number of results than of scans.
     """
     if len(drives) != len(results) or any(len(a) != len(b) for a, b in zip(drives, results, strict=True)):
-        raise ValueError(f"results: expected one per scan of {len(drives)} drives, got others")
+        raise TorchCRFScanError(f"results: expected one per scan of {len(drives)} drives, got others")
     pairs = [list(zip(drive, of, strict=True)) for drive, of in zip(drives, results, strict=True)]
     by_points = track_scores([[_by_points(*pair) for pair in drive] for drive in pairs])
     by_place = track_scores([[_by_place(*pair, scale) for pair in drive] for drive in pairs])

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from rapidfuzz.distance import Levenshtein
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import Sureness
 from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers, relabel
 from torchcrf_scan.evaluation.measures import EVERY, Count, Labelled
@@ -181,12 +182,14 @@ def edit_distance(labels: Ints, others: Ints, substitution: int) -> int:
 def _checked_annotation(pair: ScanPair, prediction: PairPrediction) -> Annotation:
     n, m = pair.source.n_beams, pair.target.n_beams
     if pair.annotation is None:
-        raise ValueError(f"pair {pair.name!r}: expected an annotation, got none")
+        raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
     if prediction.association.shape != (n,) or prediction.cluster.shape != (n,):
         got = f"association {prediction.association.shape} and cluster {prediction.cluster.shape}"
-        raise ValueError(f"prediction of pair {pair.name!r}: expected labels of all ({n},) source beams, got {got}")
+        raise TorchCRFScanError(f"prediction of pair {pair.name!r}: expected labels of all ({n},) source beams, got {got}")
     if n and int(prediction.association.max()) >= m:
-        raise ValueError(f"prediction of pair {pair.name!r}: expected association below {m}, got {prediction.association.max()}")
+        raise TorchCRFScanError(
+            f"prediction of pair {pair.name!r}: expected association below {m}, got {prediction.association.max()}"
+        )
     return pair.annotation
 
 

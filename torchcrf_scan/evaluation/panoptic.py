@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.metrics import MOVER_MIN_POINTS
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Ints, PairPrediction, ScanPair
 
@@ -43,7 +44,7 @@ class PanopticCount:
     def of(cls, pair: ScanPair, prediction: PairPrediction) -> PanopticCount:
         """The movers of an annotated pair; raises ValueError for a pair without annotation."""
         if pair.annotation is None:
-            raise ValueError(f"pair {pair.name!r}: expected an annotation, got none")
+            raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
         truth, beam = pair.annotation, pair.source.beam
         cluster = truth.cluster[beam]
         return count_segments(cluster, prediction.cluster[beam], truth.ignore[beam] | (cluster == OUTLIER))

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation import published as paper
 from torchcrf_scan.evaluation.bootstrap import intervals, paired_intervals
 from torchcrf_scan.evaluation.measures import MEASURES
@@ -216,7 +217,7 @@ def differences_table(reference: str, scores: Scores, weights: Ints) -> Table:
         ValueError: an unknown `reference`, scores of other pairs, or weights of another shape.
     """
     if reference not in scores:
-        raise ValueError(f"reference: expected one of {', '.join(map(repr, scores))}, got {reference!r}")
+        raise TorchCRFScanError(f"reference: expected one of {', '.join(map(repr, scores))}, got {reference!r}")
     rows: list[tuple[Cell, ...]] = []
     for method, of_method in scores.items():
         if method != reference:
@@ -230,7 +231,7 @@ def _table(title: str, columns: Sequence[Column], scores: Scores, weights: Ints 
     rows: list[tuple[Cell, ...]] = []
     for method, of_method in scores.items():
         if not of_method:
-            raise ValueError(f"scores: expected at least one pair for method {method!r}, got none")
+            raise TorchCRFScanError(f"scores: expected at least one pair for method {method!r}, got none")
         summary: Mapping[str, Cell] = summarise(of_method) if weights is None else intervals(of_method, weights)
         rows.append((method, *(summary[key] for _, key, _ in columns)))
     headings = ("method", *(heading for heading, _, _ in columns))

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.counterparts import clusters_beneath
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, Ints, PairPrediction, ScanPair
@@ -61,7 +62,7 @@ class FlowErrors:
         A cluster without a finite answered motion moves with the answered background, and that, if it is unknown, not at all.
         """
         if pair.annotation is None:
-            raise ValueError(f"pair {pair.name!r}: expected an annotation, got none")
+            raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
         truth, beam, points = pair.annotation, pair.source.beam, pair.source.points
         body = np.where(truth.cluster[beam] != OUTLIER, truth.cluster[beam], truth.body[beam])
         is_finite = np.asarray(np.isfinite(truth.motions).all(axis=1))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import consistency, expected_calibration_error
 from torchcrf_scan.evaluation.measures import EVERY, Count
 from torchcrf_scan.evaluation.metrics import LabelScore, MotionError, ObjectScore, PairScore
@@ -39,7 +40,7 @@ def summarise(scores: Sequence[PairScore]) -> dict[str, float]:
         ValueError: no scores.
     """
     if not scores:
-        raise ValueError("scores: expected at least one pair, got none")
+        raise TorchCRFScanError("scores: expected at least one pair, got none")
     return {
         "pairs": float(len(scores)),
         **_association_summary(scores),

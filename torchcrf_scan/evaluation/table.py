@@ -7,6 +7,7 @@ import io
 import math
 from dataclasses import dataclass
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.bootstrap import Difference, Interval
 
 Cell = str | float | Interval
@@ -36,7 +37,7 @@ class Table:
     def __post_init__(self) -> None:
         for name, length in [*((f"row {i}", len(row)) for i, row in enumerate(self.rows)), ("digits", len(self.digits))]:
             if length != len(self.columns) and not (name == "digits" and length == 0):
-                raise ValueError(f"{name}: expected {len(self.columns)} entries, one per column, got {length}")
+                raise TorchCRFScanError(f"{name}: expected {len(self.columns)} entries, one per column, got {length}")
 
     def to_markdown(self) -> str:
         """Title, note and a pipe table: numbers rounded and flush right, `-` for NaN, `*` at differences that exclude zero."""

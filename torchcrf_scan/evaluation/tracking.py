@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.metrics import MOVER_MIN_POINTS
 from torchcrf_scan.scan import BACKGROUND, Bools, Floats, Ints
 
@@ -85,7 +86,7 @@ def track_scores(sequences: Sequence[Sequence[TrackFrame]]) -> dict[str, float]:
     from trackeval.metrics import CLEAR, HOTA, Identity
 
     if not sequences:
-        raise ValueError("sequences: expected at least one, got none")
+        raise TorchCRFScanError("sequences: expected at least one, got none")
     data = [_as_trackeval(frames) for frames in sequences]
     silent = {"PRINT_CONFIG": False}
     found: dict[str, Any] = {}

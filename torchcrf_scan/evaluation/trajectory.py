@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats, Ints
 
@@ -97,9 +98,9 @@ def relative_error(poses: Floats, reference: Floats, distance: float) -> Relativ
     Source: Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
     """
     if poses.ndim != 2 or poses.shape[1] != 3 or poses.shape != reference.shape:
-        raise ValueError(f"poses: expected (S, 3) like the reference {reference.shape}, got {poses.shape}")
+        raise TorchCRFScanError(f"poses: expected (S, 3) like the reference {reference.shape}, got {poses.shape}")
     if not distance > 0:
-        raise ValueError(f"distance: expected metres above 0, got {distance}")
+        raise TorchCRFScanError(f"distance: expected metres above 0, got {distance}")
     if not len(poses):
         return RelativeError(distance, np.zeros(0), np.zeros(0))
     start, end = pairs_over(reference, distance)

@@ -23,6 +23,7 @@ from joblib import Parallel, cpu_count, delayed
 from tqdm import tqdm
 
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.experiment.methods import METHODS, Answer, answer
 from torchcrf_scan.experiment.models import fit_models
 from torchcrf_scan.experiment.settings import RunConfig
@@ -60,12 +61,12 @@ def make_folds(protocol: str, pairs: Sequence[ScanPair], tested: int, every: int
     for k, pair in enumerate(pairs[:tested]):
         groups.setdefault(pair.name if by_pair else pair.sequence, []).append(k)
     if len(groups) < 2:
-        raise ValueError(f"{protocol}: expected at least 2 to leave out in turn, got {len(groups)}: {list(groups)}")
+        raise TorchCRFScanError(f"{protocol}: expected at least 2 to leave out in turn, got {len(groups)}: {list(groups)}")
     for names in ([pair.name for pair in pairs[:tested]], list(groups)):
         paths = [file_name(name) for name in names]
         twins = [name for name, path in zip(names, paths, strict=True) if paths.count(path) > 1]
         if twins:
-            raise ValueError(f"{protocol}: expected names that differ as file names, got {', '.join(twins[:5])}")
+            raise TorchCRFScanError(f"{protocol}: expected names that differ as file names, got {', '.join(twins[:5])}")
     folds = []
     for name, members in groups.items():
         left_out = set(members)

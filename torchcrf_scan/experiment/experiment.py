@@ -16,6 +16,7 @@ from torchcrf_scan.baselines.register import BASELINES, installed
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import NAMED_WORLDS
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.bootstrap import by_blocks, by_sequence
 from torchcrf_scan.evaluation.metrics import PairScore, score_pairs
 from torchcrf_scan.evaluation.report import Scores, differences_table, report, sequences_table
@@ -149,7 +150,7 @@ def load_pairs(config: RunConfig) -> tuple[list[ScanPair], int]:
     tested = list(PairFiles(*patterns)) if patterns else simulate(experiment.worlds, config, data.seed)
     bare = [pair.name for pair in tested if pair.annotation is None]
     if bare or not tested:
-        raise ValueError(f"experiment.pairs: expected annotated pairs, got {bare[:3] or 'none'}")
+        raise TorchCRFScanError(f"experiment.pairs: expected annotated pairs, got {bare[:3] or 'none'}")
     return [*tested, *simulate(experiment.also_train, config, data.seed + ALSO_TRAIN_SEED)], len(tested)
 
 
@@ -181,7 +182,7 @@ def claim(folder: Path, config: RunConfig, pairs: Sequence[ScanPair]) -> None:
         differ = sorted(differing(ours, theirs))
         if differ:
             names = ", ".join(differ[:5])
-            raise ValueError(f"--output {folder}: expected the folder of the same experiment, got one with another {names}")
+            raise TorchCRFScanError(f"--output {folder}: expected the folder of the same experiment, got one with another {names}")
         return
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(path, json.dumps(ours, indent=1) + "\n")
@@ -212,7 +213,7 @@ def find_pairs(wanted: Sequence[str], pairs: Sequence[ScanPair]) -> list[ScanPai
         members = by_sequence.get(sequence, [])
         if not (number.isdigit() and int(number) < len(members)):
             known = ", ".join(f"{key}:0..{len(of) - 1}" for key, of in by_sequence.items())
-            raise ValueError(f"experiment.figures: expected SEQUENCE:NUMBER out of {known}, got {name}")
+            raise TorchCRFScanError(f"experiment.figures: expected SEQUENCE:NUMBER out of {known}, got {name}")
         found.append(members[int(number)])
     return found
 

@@ -14,6 +14,7 @@ from torchcrf_scan.baselines.cascade import Cascade
 from torchcrf_scan.baselines.icp import GATES, choose_gate
 from torchcrf_scan.choices import SCHEDULES
 from torchcrf_scan.config import EncoderConfig, ModelConfig
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning.calibration_fit import calibrate
@@ -84,7 +85,7 @@ def fit_encoded(joint: JointScanCRF, pairs: Sequence[ScanPair], material: Sequen
         ValueError: the config has no first-order objective.
     """
     if not config.has_steps:
-        raise ValueError("gradient.objective: expected one for a model with an encoder, got none")
+        raise TorchCRFScanError("gradient.objective: expected one for a model with an encoder, got none")
     model = JointScanCRF(config.model)
     load_weights(model, config.init or joint)
     alone = replace(config, gradient=replace(config.gradient, workers=0))  # no workers in a fold's process; same pairs

@@ -9,12 +9,22 @@ from typing import Any
 import yaml
 from jsonargparse import ArgumentParser, get_loader, set_loader
 
+from torchcrf_scan.data.bounded_yaml import check_size
 from torchcrf_scan.experiment.settings import RunConfig
 
-MOST_VALUES, DEEPEST = 10_000, 50  # limits of a YAML file; ours have some fifty values, four levels deep
+
+class SettingsParser(ArgumentParser):
+    """An `ArgumentParser` that refuses a file of other bytes than text as it refuses other settings."""
+
+    def parse_path(self, path: str, *args: Any, **options: Any) -> Any:
+        """The settings of a file."""
+        try:
+            return super().parse_path(path, *args, **options)
+        except UnicodeDecodeError as error:
+            raise TypeError(f"{path}: expected a text, got {error}") from error
 
 
-def settings_parser(kind: type[ArgumentParser] = ArgumentParser, **options: Any) -> ArgumentParser:
+def settings_parser(kind: type[ArgumentParser] = SettingsParser, **options: Any) -> ArgumentParser:
     """A parser of the fields of `RunConfig`, from YAML files (`--config`) and one by one. options: of `ArgumentParser`."""
     _bound_yaml()
     parser = kind(**options)
@@ -48,26 +58,3 @@ def _bound_yaml() -> Any:
 
     set_loader("yaml", load_bounded, (yaml.YAMLError,))
     return load_bounded
-
-
-def check_size(text: str) -> None:
-    """Raises yaml.YAMLError if a text expands to more values or levels than settings need; in time linear in its length."""
-    sizes: dict[str, int] = {}  # number of values of every anchor
-    open_: list[tuple[str | None, int]] = [(None, 0)]  # anchors being read, with the values in them so far
-    for event in yaml.parse(text, yaml.SafeLoader):
-        anchor, count = getattr(event, "anchor", None), 0
-        if isinstance(event, yaml.CollectionStartEvent):
-            open_.append((anchor, 1))
-            if anchor is not None:
-                sizes[anchor] = MOST_VALUES + 1  # until it is complete: a recursive anchor is infinite
-        elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, count = open_.pop()
-        elif isinstance(event, yaml.ScalarEvent):
-            count = 1
-        elif isinstance(event, yaml.AliasEvent):
-            anchor, count = None, sizes.get(event.anchor, 1)
-        if count and anchor is not None:
-            sizes[anchor] = count
-        open_[-1] = (open_[-1][0], open_[-1][1] + count)
-        if open_[-1][1] > MOST_VALUES or len(open_) > DEEPEST:
-            raise yaml.YAMLError(f"expected at most {MOST_VALUES} values with aliases written out, {DEEPEST} levels deep, got more")

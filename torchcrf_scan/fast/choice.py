@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from torchcrf_scan.config import ModelConfig
+from torchcrf_scan.errors import TorchCRFScanError
 
 
 def can_run(backend: str, device: torch.device) -> bool:
@@ -59,5 +60,5 @@ def _why_not_here(device: torch.device) -> str | None:
 
 def _decide(backend: str, reason: str | None) -> bool:
     if backend == "compiled" and reason is not None:
-        raise ValueError(f"backend: expected for compiled {reason}")
+        raise TorchCRFScanError(f"backend: expected for compiled {reason}")
     return backend != "eager" and reason is None

@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchcrf_scan.errors import TorchCRFScanError
+
 
 class StumpEnsemble(nn.Module):
     """H(phi) = sum_t alpha_t h_t(phi) over `stumps` decision stumps (spec 2.2); zero until it is fitted.
@@ -70,7 +72,7 @@ class StumpEnsemble(nn.Module):
     def forward(self, phi: Tensor) -> Tensor:
         """Margin H. phi: (..., F). Returns (...)."""
         if phi.shape[-1] != len(self.thresholds):
-            raise ValueError(f"phi: expected {len(self.thresholds)} features, got {phi.shape[-1]}")
+            raise TorchCRFScanError(f"phi: expected {len(self.thresholds)} features, got {phi.shape[-1]}")
         return self.margins(phi)
 
 

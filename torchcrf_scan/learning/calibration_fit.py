@@ -13,6 +13,7 @@ from scipy.special import expit
 from scipy.stats import chi2
 
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import MOTION_FREEDOM, background_nees, rightness
 from torchcrf_scan.inference.uncertainty import WITHIN, Calibration, association_log_odds, cluster_log_odds
 from torchcrf_scan.learning.material import Material
@@ -52,7 +53,7 @@ class Judged:
     def joined(cls, parts: Sequence[Judged]) -> Judged:
         """Concatenates all parts. Raises ValueError for none."""
         if not parts:
-            raise ValueError("parts: expected at least one, got none")
+            raise TorchCRFScanError("parts: expected at least one, got none")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
 
 
@@ -146,7 +147,7 @@ def fit_confidence(log_odds: ArrayLike, is_right: ArrayLike) -> Floats:
     """
     values, right = np.asarray(log_odds, dtype=np.float64), np.asarray(is_right, dtype=bool)
     if not len(values) or values.shape != right.shape:
-        raise ValueError(f"log_odds: expected one or more (P,) and is_right as many, got {values.shape} and {right.shape}")
+        raise TorchCRFScanError(f"log_odds: expected one or more (P,) and is_right as many, got {values.shape} and {right.shape}")
     yes, no = int(right.sum()), int((~right).sum())
     target = np.where(right, (yes + 1) / (yes + 2), 1 / (no + 2))
 
@@ -172,5 +173,5 @@ def fit_covariance_factor(nees: ArrayLike, quantile: float = FIT_QUANTILE, freed
     """
     values = np.asarray(nees, dtype=np.float64)
     if not len(values):
-        raise ValueError("nees: expected at least one number, got none")
+        raise TorchCRFScanError("nees: expected at least one number, got none")
     return float(np.quantile(values, quantile) / chi2.ppf(quantile, freedom))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import pickle
 import random
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.pretrained import check_weights
 from torchcrf_scan.whole_file import write_whole
 
 log = logging.getLogger(__name__)
@@ -66,14 +67,16 @@ class Store:
         try:
             state = torch.load(self.path, map_location="cpu", weights_only=True)
             written, settings = state["format"], state["settings"]
-        except (RuntimeError, EOFError, KeyError, TypeError, pickle.UnpicklingError) as error:
-            raise ValueError(f"resume: expected a checkpoint of this program, got {self.path}: {error}") from error
+        except Exception as error:  # of torch, zipfile and pickle, for damaged files
+            raise TorchCRFScanError(f"resume: expected a checkpoint of this program, got {self.path}: {error}") from error
         if written != FORMAT:
-            raise ValueError(f"resume: expected a checkpoint of format {FORMAT}, got {written}: {self.path}")
+            raise TorchCRFScanError(f"resume: expected a checkpoint of format {FORMAT}, got {written}: {self.path}")
         other = [name for name in self.settings if settings.get(name) != self.settings[name]]
         if other:
             told = ", ".join(f"{name} = {self.settings[name]!r} after {settings.get(name)!r}" for name in other[:5])
-            raise ValueError(f"resume: expected the settings of the run in {self.folder}, got {told}")
+            raise TorchCRFScanError(f"resume: expected the settings of the run in {self.folder}, got {told}")
+        for part in ("model", "best"):
+            check_weights(f"resume: {self.path}: {part}", state.get(part) or {})
         self.last = state["step"]
         return dict(state)
 
@@ -89,7 +92,7 @@ def load_weights(model: JointScanCRF, origin: str | JointScanCRF) -> None:
     try:
         model.load_state_dict(fresh | saved)
     except RuntimeError as error:
-        raise ValueError(f"init: expected a model with the features of `model.features`, got {origin}: {error}") from error
+        raise TorchCRFScanError(f"init: expected a model with the features of `model.features`, got {origin}: {error}") from error
 
 
 def random_state() -> dict[str, Any]:

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.optim import AdamW
 from torch.optim.swa_utils import AveragedModel
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.learning.checkpoint import Store, set_random_state
 from torchcrf_scan.learning.losses import LOSSES
 from torchcrf_scan.learning.objectives import Objective, known_nodes, make_objective
@@ -183,7 +184,9 @@ def refuse_remainder(gradient: GradientConfig, ranks: Ranks) -> None:
     """Raises ValueError where the parts of a step cannot be divided evenly among the processes."""
     if gradient.batch_size // gradient.part % ranks.world:
         parts = f"{gradient.batch_size} / {gradient.part}"
-        raise ValueError(f"gradient.part: expected {parts} parts to be shared out among {ranks.world} processes, got a remainder")
+        raise TorchCRFScanError(
+            f"gradient.part: expected {parts} parts to be shared out among {ranks.world} processes, got a remainder"
+        )
 
 
 def portions_from(step: int, config: Config, pairs: Sequence[ScanPair], ranks: Ranks) -> Iterator[Portion]:

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from torchcrf_scan.checks import check_fields, from_values
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import find_weights
 from torchcrf_scan.scan import ScanPair
 from torchcrf_scan.whole_file import write_whole
@@ -50,7 +51,7 @@ class TrainedOn:
         try:
             found = from_values(cls, json.loads(path.read_text()), RECORD) if path.is_file() else cls(is_complete=False)
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"{path}: {error}") from error
+            raise TorchCRFScanError(f"{path}: {error}") from error
         if not found.is_complete:
             log.warning("%s: no complete record of what it was trained on, so a test on the same sequences is not refused", path)
         return found
@@ -71,4 +72,4 @@ class TrainedOn:
         both = sorted({*self.sequences} & {pair.sequence for pair in tested})
         if both:
             told = ", ".join(name or "one without a name" for name in both[:5])
-            raise ValueError(f"{setting}: expected no sequence in both training and test pairs, got {told}")
+            raise TorchCRFScanError(f"{setting}: expected no sequence in both training and test pairs, got {told}")

@@ -11,6 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.learning.disturb import disturb
 from torchcrf_scan.learning.hypothesis_fit import HypothesisView, fit_hypothesis_score, view_pair
@@ -96,7 +97,7 @@ def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) ->
     """
     bare = [pair.name for pair in pairs if pair.annotation is None]
     if bare or not pairs:
-        raise ValueError(f"pairs: expected annotated pairs, got {bare[:3] or 'none'}")
+        raise TorchCRFScanError(f"pairs: expected annotated pairs, got {bare[:3] or 'none'}")
     batch = ScanPairBatch.collate(pairs)
     if config.disturbance > 0:
         batch = disturb(batch, config.disturbance, torch.Generator().manual_seed(config.seed))

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import rightness
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.inference.uncertainty import WITHIN
@@ -98,9 +99,9 @@ def calibrate_on(
     is_certain = len(pairs) > 0
     pairs, also = (pairs, also) if is_certain else (also, ())
     if len(pairs) < 2 or any(pair.annotation is None for pair in pairs):
-        raise ValueError(f"pairs: expected two or more annotated pairs, got {len(pairs)}, or one without annotation")
+        raise TorchCRFScanError(f"pairs: expected two or more annotated pairs, got {len(pairs)}, or one without annotation")
     if not (model.config.has_association and model.config.has_clusters):
-        raise ValueError(f"chains: expected joint for a model to calibrate, got {model.config.chains}")
+        raise TorchCRFScanError(f"chains: expected joint for a model to calibrate, got {model.config.chains}")
     given = Given(pairs, folds_of(pairs), also)
     fits: list[FitPart] = [] if learning is None else [partial(fit_own_weights, learning=learning)]
     fits += [fit_distance, fit_own_scales, fit_worth, fit_confidences] if is_certain else [fit_own_scales, fit_worth]

@@ -12,6 +12,8 @@ from typing import TypeVar, cast
 import torch
 from torch import Tensor, distributed, nn
 
+from torchcrf_scan.errors import TorchCRFScanError
+
 T = TypeVar("T")
 CPU = torch.device("cpu")
 PATIENCE = timedelta(hours=24)  # the others wait for the staged fit of the first one
@@ -72,7 +74,7 @@ def join(device: str = "auto", environment: Mapping[str, str] = os.environ) -> I
     """
     has_gpu = torch.cuda.is_available()
     if device == "cuda" and not has_gpu:
-        raise ValueError("gradient.device: expected cpu or auto on a machine without a GPU, got cuda")
+        raise TorchCRFScanError("gradient.device: expected cpu or auto on a machine without a GPU, got cuda")
     on_gpu = has_gpu and device != "cpu"
     place = torch.device("cuda", int(environment.get("LOCAL_RANK", 0))) if on_gpu else torch.device("cpu")
     world = int(environment.get("WORLD_SIZE", 1))

@@ -11,6 +11,7 @@ import numpy as np
 from torchcrf_scan.data.dataset import PairFiles, split_by_sequence
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import NAMED_WORLDS
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.learning.leaks import TrainedOn
 from torchcrf_scan.learning.ranks import Ranks
 from torchcrf_scan.learning.self_labelled import label_recordings
@@ -68,7 +69,7 @@ def load(config: Config, ranks: Ranks) -> RunData:
 def load_annotated(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
     """Training and test pairs with annotation: files, then simulated worlds."""
     if not (config.train or config.simulate_train or config.unlabelled):
-        raise ValueError("data.simulate_train: expected a world at least where data.train names no files, got none")
+        raise TorchCRFScanError("data.simulate_train: expected a world at least where data.train names no files, got none")
 
     def read(patterns: tuple[str, ...] | str, worlds: tuple[str, ...], seed: int) -> list[ScanPair]:
         patterns = (patterns,) if isinstance(patterns, str) else patterns
@@ -109,4 +110,4 @@ def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], lis
     try:
         return split_by_sequence(pairs, config.gradient.validation, config.gradient.seed)
     except ValueError as error:
-        raise ValueError(f"gradient.validation: {error}") from error
+        raise TorchCRFScanError(f"gradient.validation: {error}") from error

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.features import association
 from torchcrf_scan.features.candidates import squared_distances
 from torchcrf_scan.features.potentials import AssociationStates, Boosters, PairView, association_unary
@@ -37,7 +38,7 @@ def fit_scales(views: Sequence[PairView], plugins: Sequence[PlugIns]) -> Scales:
     parts = [true_errors(view, plug) for view, plug in zip(views, plugins, strict=True)]
     errors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     if len(errors["cluster"]) == 0:
-        raise ValueError("pairs: expected at least one true association to fit the scales on, got none")
+        raise TorchCRFScanError("pairs: expected at least one true association to fit the scales on, got none")
     scales = Scales()
     for f, name in enumerate(LOCAL_CHANNELS):
         scales.local[f] = robust_scale(errors[name], FLOOR)

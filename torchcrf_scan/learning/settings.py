@@ -9,6 +9,7 @@ from typing import Annotated
 from torchcrf_scan.checks import Amount, OneOf, Positive, Seed, Share, Within, check_fields
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.data.worlds import NAMED_WORLDS
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.learning.losses import LOSSES, NO_STEPS, STAGED
 
 Count = Annotated[int, Within(1, 1_000_000)]
@@ -180,9 +181,9 @@ class GradientConfig:
     def __post_init__(self) -> None:
         check_fields(self, "gradient.")
         if self.batch_size % self.part:
-            raise ValueError(f"gradient.part: expected a divisor of batch_size = {self.batch_size}, got {self.part}")
+            raise TorchCRFScanError(f"gradient.part: expected a divisor of batch_size = {self.batch_size}, got {self.part}")
         if self.fresh > 0 and not self.worlds:
-            raise ValueError(f"gradient.worlds: expected at least one with gradient.fresh = {self.fresh}, got none")
+            raise TorchCRFScanError(f"gradient.worlds: expected at least one with gradient.fresh = {self.fresh}, got none")
 
 
 @dataclass(frozen=True)
@@ -244,10 +245,10 @@ class Config:
     def __post_init__(self) -> None:
         check_fields(self)
         if not self.output:
-            raise ValueError("output: expected a folder, got an empty name")
+            raise TorchCRFScanError("output: expected a folder, got an empty name")
         other, staged = self.gradient.objective, self.learning.objective
         if not LOSSES[staged].is_staged and other not in (NO_STEPS, staged):
-            raise ValueError(f"gradient.objective: expected {staged} with learning.objective {staged}, got {other}")
+            raise TorchCRFScanError(f"gradient.objective: expected {staged} with learning.objective {staged}, got {other}")
 
     @property
     def first_order(self) -> str:

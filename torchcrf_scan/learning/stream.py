@@ -15,6 +15,7 @@ from torch.utils.data import Dataset
 
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import NAMED_WORLDS
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.learning.augment import augment, frame_offset
 from torchcrf_scan.learning.settings import GradientConfig
 from torchcrf_scan.scan import Floats, ScanPair
@@ -44,7 +45,7 @@ class PairStream(Dataset[Sample]):
 
     def __init__(self, config: GradientConfig, pairs: Sequence[ScanPair] = ()) -> None:
         if config.fresh < 1 and not pairs:
-            raise ValueError(f"gradient.fresh: expected 1 without training pairs, got {config.fresh}")
+            raise TorchCRFScanError(f"gradient.fresh: expected 1 without training pairs, got {config.fresh}")
         self.config = config
         self.pairs = tuple(pairs) if config.fresh < 1 else ()
         weights = torch.tensor([pair.annotation.weight for pair in self.pairs if pair.annotation], dtype=torch.float64)

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, Truth
 from torchcrf_scan.config import ModelConfig
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import State
@@ -96,7 +97,7 @@ def unrolled_sums(
 ) -> dict[str, Sum]:
     """The terms of `unrolled_loss` as sums and counts. A chain missing in the model has count 0."""
     if batch.truth is None:
-        raise ValueError("batch.truth: expected annotated pairs, got a batch without truth")
+        raise TorchCRFScanError("batch.truth: expected annotated pairs, got a batch without truth")
     start = start or model.initialise(batch)
     weights = round_weights(config)
     learned = model.learned_inputs(batch, start, **layer_inputs)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.live.types import struct, type_hash
 
 LOOPBACK = "127.0.0.1"
@@ -33,7 +34,7 @@ class Network:
         """The number of the domain; raises ValueError if it is none from 0 to 232."""
         told = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0" if self.domain is None else str(self.domain)
         if not (told.isdecimal() and int(told) <= 232):
-            raise ValueError(f"domain: expected a number from 0 to 232, got {told}")
+            raise TorchCRFScanError(f"domain: expected a number from 0 to 232, got {told}")
         return int(told)
 
     def to_xml(self) -> str:
@@ -62,13 +63,13 @@ class Connection:
         try:
             from cyclonedds.domain import Domain, DomainParticipant
         except ImportError as error:
-            raise ValueError(f"listening: expected the library cyclonedds (extra `ros2`), got {error}") from error
+            raise TorchCRFScanError(f"listening: expected the library cyclonedds (extra `ros2`), got {error}") from error
         number, settings = network.number, network.to_xml()
         try:
             self._domain = Domain(number, settings) if settings else None
             self.participant = DomainParticipant(number)
         except Exception as error:  # of the library
-            raise ValueError(f"domain {number}: expected a network that cyclonedds can use, got {error}") from error
+            raise TorchCRFScanError(f"domain {number}: expected a network that cyclonedds can use, got {error}") from error
 
     def reader(self, topic: str, kind: str, depth: int) -> Any:
         """A reader that keeps the newest `depth` messages of a topic, best effort: it fits any writer."""
@@ -95,7 +96,7 @@ def dds_name(topic: str) -> str:
     """The name by which DDS knows a topic of ROS 2: /scan is rt/scan. Raises ValueError if it is no name of a topic."""
     parts = topic.strip("/").split("/")
     if not all(part.isidentifier() and part.isascii() for part in parts):
-        raise ValueError(f"topic: expected a name like /scan, got {topic!r}")
+        raise TorchCRFScanError(f"topic: expected a name like /scan, got {topic!r}")
     return "/".join(["rt", *parts])
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from torchcrf_scan.errors import TorchCRFScanError
+
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
@@ -26,7 +28,7 @@ def typestore() -> Typestore:
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
-        raise ValueError(f"listening: expected the library rosbags (extra `ros2`), got {error}") from error
+        raise TorchCRFScanError(f"listening: expected the library rosbags (extra `ros2`), got {error}") from error
     store = get_typestore(Stores.LATEST)
     for name, definition in EXTRA.items():
         store.register(get_types_from_msg(definition, name))

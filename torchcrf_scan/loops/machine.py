@@ -24,6 +24,7 @@ from threading import Lock
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.loops.background import Background
 
 PACKAGE = Path(__file__).parents[1]
@@ -139,7 +140,7 @@ def load(part: str, level: str) -> dict[str, Code] | None:
         try:
             told = json.loads(path.with_suffix(".json").read_bytes())
             if hashlib.sha256(path.read_bytes()).hexdigest() != told["sha256"]:
-                raise ValueError("not what was written")
+                raise TorchCRFScanError("not what was written")
             extension = _import(path, part)
             return {name: Code(getattr(extension, symbol(name)), layouts) for name, layouts in told["entries"].items()}
         except FileNotFoundError:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcrf_scan.batch import ScanPairBatch, finite, initial_motion_of, range_noise_of
 from torchcrf_scan.loops.jit import Array, Booleans, Integers
-from torchcrf_scan.scan import ScanPair
+from torchcrf_scan.scan import FARTHEST, LONGEST, ScanPair
 
 
 class Pair(NamedTuple):
@@ -76,8 +76,8 @@ def pair_of(batch: ScanPairBatch, b: int) -> Pair:
 def pair_of_scans(pair: ScanPair, dtype: torch.dtype) -> Pair:
     """The pair rounded to a dtype as `ScanPairBatch.collate` rounds it, so that `match` and `forward` give the same labels."""
 
-    def rounded(name: str, values: NDArray | float) -> Array:
-        return array_of(finite(name, torch.as_tensor(values, dtype=torch.float64).to(dtype)))
+    def rounded(name: str, values: NDArray | float, most: float = FARTHEST) -> Array:
+        return array_of(finite(name, torch.as_tensor(values, dtype=torch.float64).to(dtype), most))
 
     return Pair(
         rounded("source", pair.source.points),
@@ -87,7 +87,7 @@ def pair_of_scans(pair: ScanPair, dtype: torch.dtype) -> Pair:
         rounded("range_noise", range_noise_of(pair)).item(),
         rounded("initial_motion", initial_motion_of(pair)),
         np.zeros(2),
-        rounded("dt", pair.dt).item(),
+        rounded("dt", pair.dt, LONGEST).item(),
     )
 
 

@@ -24,8 +24,15 @@ def _helpers(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, thread_name_prefix="torchcrf_scan")
 
 
+def _begin_anew() -> None:
+    """In a forked child of a process that has used several threads: none of them exists there, torch's own neither."""
+    if _helpers.cache_info().currsize:
+        _helpers.cache_clear()
+        torch.set_num_threads(1)  # more would wait for ever for the threads of the parent's OpenMP
+
+
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_helpers.cache_clear)  # the parent's threads do not exist there
+    os.register_at_fork(after_in_child=_begin_anew)
 
 
 def for_each(function: Callable[[T], R], items: Sequence[T]) -> list[R]:

@@ -20,6 +20,7 @@ from torchcrf_scan.loops.background import PROGRESS_FILE, lacks_compiler
 from torchcrf_scan.loops.layout import Layout
 from torchcrf_scan.prepare import extension
 from torchcrf_scan.prepare.record import record_layouts
+from torchcrf_scan.whole_file import whole_path, write_whole
 
 LOCK_FILE = "lock"
 Progress = Callable[[int, int], None]
@@ -74,19 +75,17 @@ def _build_level(level: str, parts: Sequence[str], folder: Path) -> Iterator[str
             part = waiting[future]
             objects, exports = future.result()
             path = machine.library(folder, part, level)
-            beside = path.with_name(f".{os.getpid()}-{path.name}")
-            extension.link([*objects, *common.result()], exports, level, beside)
-            _publish(beside, path, {name: of for name, of in layouts.items() if machine.part_of(name) == part})
+            with whole_path(path) as beside:
+                extension.link([*objects, *common.result()], exports, level, beside)
+            _list_entries(path, {name: of for name, of in layouts.items() if machine.part_of(name) == part})
             _remove_older(path, part, level)
             yield part
 
 
-def _publish(beside: Path, path: Path, layouts: dict[str, list[Layout]]) -> None:
-    """Moves an extension to its final place, then writes its list of entries, so that no incomplete file is visible."""
-    told = {"sha256": hashlib.sha256(beside.read_bytes()).hexdigest(), "entries": layouts}
-    os.replace(beside, path)
-    beside.write_text(json.dumps(told))
-    os.replace(beside, path.with_suffix(".json"))
+def _list_entries(path: Path, layouts: dict[str, list[Layout]]) -> None:
+    """Writes the list of a whole extension's entries, without which it is not loaded."""
+    told = {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "entries": layouts}
+    write_whole(path.with_suffix(".json"), json.dumps(told))
 
 
 def _remove_older(path: Path, part: str, level: str) -> None:

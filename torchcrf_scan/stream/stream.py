@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.result import ScanResult, Status
@@ -92,7 +93,7 @@ class ScanStream:
             ValueError: odometry of another shape.
         """
         if odometry is not None and np.shape(odometry) != (3,):
-            raise ValueError(f"odometry: expected three numbers (theta, x, y), got shape {np.shape(odometry)}")
+            raise TorchCRFScanError(f"odometry: expected three numbers (theta, x, y), got shape {np.shape(odometry)}")
         interval = self._advance(scan, stamp)
         predicted = self._predict(interval, odometry)
         if len(scan) < FEWEST_POINTS:

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from torchcrf_scan.checks import Amount, Positive, Within, check_fields
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.result import MovingObject
 from torchcrf_scan.scan import Floats
@@ -56,7 +57,7 @@ class TrackerConfig:
     def __post_init__(self) -> None:
         check_fields(self)
         if self.among < self.sightings:
-            raise ValueError(f"among: expected at least sightings = {self.sightings}, got {self.among}")
+            raise TorchCRFScanError(f"among: expected at least sightings = {self.sightings}, got {self.among}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.result import MovingObject
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints
 from torchcrf_scan.stream.assignment import Comparison, assign, twins
@@ -102,7 +103,7 @@ class Tracker:
         points, cluster, velocities, covariances = _checked(stamp, points, cluster, velocities, covariances)
         rates = np.zeros(len(velocities)) if turns is None else np.asarray(turns, dtype=np.float64)
         if rates.shape != (len(velocities),):
-            raise ValueError(f"turns: expected ({len(velocities)},), got {rates.shape}")
+            raise TorchCRFScanError(f"turns: expected ({len(velocities)},), got {rates.shape}")
         labels = [k for k in range(1, len(velocities) + 1) if (cluster == k).any()]
         sightings = [
             Sighting.of(points[cluster == k], velocities[k - 1], covariances[k - 1], since, float(rates[k - 1]), self.config)
@@ -169,15 +170,15 @@ def _checked(
     points, velocities = np.asarray(points, dtype=np.float64), np.asarray(velocities, dtype=np.float64)
     cluster, covariances = np.asarray(cluster), np.asarray(covariances, dtype=np.float64)
     if not np.isfinite(stamp):
-        raise ValueError(f"stamp: expected finite seconds, got {stamp}")
+        raise TorchCRFScanError(f"stamp: expected finite seconds, got {stamp}")
     if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
-        raise ValueError(f"points: expected finite numbers (N, 2), got {points.shape}")
+        raise TorchCRFScanError(f"points: expected finite numbers (N, 2), got {points.shape}")
     if cluster.shape != (len(points),):
-        raise ValueError(f"cluster: expected one label per point ({len(points)},), got {cluster.shape}")
+        raise TorchCRFScanError(f"cluster: expected one label per point ({len(points)},), got {cluster.shape}")
     if velocities.ndim != 2 or velocities.shape[1] != 2:
-        raise ValueError(f"velocities: expected (K, 2), got {velocities.shape}")
+        raise TorchCRFScanError(f"velocities: expected (K, 2), got {velocities.shape}")
     if covariances.shape != (len(velocities), 2, 2):
-        raise ValueError(f"covariances: expected ({len(velocities)}, 2, 2), got {covariances.shape}")
+        raise TorchCRFScanError(f"covariances: expected ({len(velocities)}, 2, 2), got {covariances.shape}")
     if len(cluster) and not (cluster.min() >= OUTLIER and cluster.max() <= BACKGROUND + len(velocities)):
-        raise ValueError(f"cluster: expected labels in [-1, {len(velocities)}], got {cluster.min()} to {cluster.max()}")
+        raise TorchCRFScanError(f"cluster: expected labels in [-1, {len(velocities)}], got {cluster.min()} to {cluster.max()}")
     return points, cluster, velocities, covariances

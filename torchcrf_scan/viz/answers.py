@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 
@@ -57,9 +58,9 @@ def _labels(pair: ScanPair, name: str, given: Annotation | PairPrediction) -> La
     motions = np.asarray(given.motions, dtype=np.float64)
     for key, values in (("association", association), ("cluster", cluster)):
         if values.shape != (pair.source.n_beams,):
-            raise ValueError(f"{name}.{key}: expected shape ({pair.source.n_beams},), got {values.shape}")
+            raise TorchCRFScanError(f"{name}.{key}: expected shape ({pair.source.n_beams},), got {values.shape}")
     if (association >= pair.target.n_beams).any():
-        raise ValueError(f"{name}.association: expected indices below {pair.target.n_beams}, got {association.max()}")
+        raise TorchCRFScanError(f"{name}.association: expected indices below {pair.target.n_beams}, got {association.max()}")
     return Labels(association, cluster, motions.reshape(-1, 3))
 
 
@@ -92,7 +93,7 @@ def all_answers(pair: ScanPair, predictions: Mapping[str, PairPrediction], befor
     """
     truth = true_labels(pair)
     if truth is None and not predictions:
-        raise ValueError("predictions: expected at least one method for a pair without annotation, got none")
+        raise TorchCRFScanError("predictions: expected at least one method for a pair without annotation, got none")
     if truth is not None and before is not None:
         truth = _renumber(truth, before)
     answers = []

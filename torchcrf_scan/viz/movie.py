@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.viz.canvas import Image
 from torchcrf_scan.viz.frames import SEEN, STATUS_COLORS
 from torchcrf_scan.viz.marks import INK, MOVERS
@@ -40,9 +41,11 @@ def check_movie(option: str, path: str | Path) -> Path:
     """The path of a movie that can be written here; raises ValueError otherwise."""
     ending = Path(path).suffix.lower()
     if ending not in ENDINGS:
-        raise ValueError(f"{option}: expected a name ending in {' or '.join(ENDINGS)}, got {path}")
+        raise TorchCRFScanError(f"{option}: expected a name ending in {' or '.join(ENDINGS)}, got {path}")
     if ending == ".mp4" and not can_write_mp4():
-        raise ValueError(f"{option}: expected the extra torchcrf-scan[movie] to be installed, or a name ending in .gif, got {path}")
+        raise TorchCRFScanError(
+            f"{option}: expected the extra torchcrf-scan[movie] to be installed, or a name ending in .gif, got {path}"
+        )
     return Path(path)
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, PairPrediction, ScanPair
 from torchcrf_scan.viz.answers import Answer, all_answers, judge, predicted_labels, true_labels
@@ -121,7 +122,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: float = 130.0
     """
     path = Path(path)
     if path.suffix.lower() != ".png":
-        raise ValueError(f"path: expected a name ending in .png, got {path.name!r}")
+        raise TorchCRFScanError(f"path: expected a name ending in .png, got {path.name!r}")
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as file:
         figure.savefig(file, format="png", dpi=dpi)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, PairPrediction, ScanPair
 from torchcrf_scan.viz.answers import Answer, Labels, all_answers, carried_on
 from torchcrf_scan.viz.layout import draw_frame, finish, make_canvas
@@ -88,7 +89,7 @@ def _steps(
     """The steps of every method, the truth last, all in one window; and the window around the largest mover."""
     bare = [pair.name for pair in pairs if pair.annotation is None]
     if bare:
-        raise ValueError(f"pairs: expected annotated pairs, got {bare[0]} without annotation")
+        raise TorchCRFScanError(f"pairs: expected annotated pairs, got {bare[0]} without annotation")
     answers: list[list[Answer]] = []
     before: Labels | None = None
     for k, pair in enumerate(pairs):

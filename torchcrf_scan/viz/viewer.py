@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.result import ScanResult
 from torchcrf_scan.scan import BACKGROUND, Bools, Floats
@@ -39,7 +40,7 @@ def check_viewer(option: str) -> None:
     try:
         import rerun  # noqa: F401
     except ImportError as error:
-        raise ValueError(f"{option}: expected the extra torchcrf-scan[viewer] to be installed, got {error}") from error
+        raise TorchCRFScanError(f"{option}: expected the extra torchcrf-scan[viewer] to be installed, got {error}") from error
 
 
 @contextmanager
