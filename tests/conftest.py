@@ -1,5 +1,6 @@
 """Fixtures of all tests: fixed seeds, and the recordings that lie beside the repository but never in it."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -18,6 +19,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one of as many processes as there are
     os.environ |= {"OMP_NUM_THREADS": "1", "LOKY_MAX_CPU_COUNT": "1"}
 
 os.environ["TORCHCRF_SCAN_PREPARE"] = "0"  # nothing is built behind the tests
+gc.disable()  # while half a million objects are made that stay: modules and tests
 
 settings.register_profile(  # the same examples in every run, and no failure because the machine is busy
     "repository", derandomize=True, max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow]
@@ -34,6 +36,12 @@ def pytest_sessionstart() -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with tests of many seconds come first: nobody waits for them at the end, when the other tests are done."""
     items.sort(key=lambda item: item.path.name not in LONG)
+
+
+def pytest_collection_finish() -> None:
+    """From now on garbage is collected, but not searched for among what stays."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)

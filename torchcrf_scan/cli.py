@@ -108,7 +108,11 @@ def arguments_of(command: Callable[..., int], values: dict[str, Any]) -> dict[st
 
 
 def make_parser(wanted: Collection[str] = ()) -> CommandParser:
-    """The parser of the wanted commands; of all where there are none, which takes a quarter of a second."""
+    """The parser of all commands, which takes a quarter of a second to make, or of those that are wanted.
+
+    Args:
+        wanted: names of commands; empty: all.
+    """
     set_parsing_settings(add_print_completion_argument=True)  # of a shell, where shtab is installed
     description = "Associations, moving objects and motions between two consecutive planar laser scans."
     parser = CommandParser(prog="torchcrf-scan", description=description, version=__version__)
