@@ -21,7 +21,6 @@ from torchcrf_scan.commands.calibrate import calibrate
 from torchcrf_scan.commands.drives import drives
 from torchcrf_scan.commands.evaluate import evaluate
 from torchcrf_scan.commands.experiment import experiment, experiment_parser
-from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.commands.listen import listen
 from torchcrf_scan.commands.match import match
 from torchcrf_scan.commands.odometry import odometry
@@ -33,6 +32,7 @@ from torchcrf_scan.commands.recording import Options
 from torchcrf_scan.commands.run import run
 from torchcrf_scan.commands.simulate import simulate
 from torchcrf_scan.commands.track import track
+from torchcrf_scan.safe_names import one_line
 
 COMMANDS: Mapping[str, Callable[..., int]] = {
     "run": run,

@@ -57,6 +57,12 @@ def whole_path(path: Path) -> Iterator[Path]:
     _sync(path.parent)
 
 
+def move_whole(path: Path, target: Path) -> None:
+    """Moves a file within its file system: it is never in both places. Raises OSError if it could not be moved."""
+    os.replace(path, target)
+    _sync(target.parent)
+
+
 def _beside(path: Path) -> Path:
     """A name in the same folder; raises OSError where a device or pipe would be replaced, such as /dev/null by a superuser."""
     if path.exists() and not (path.is_file() or path.is_dir()):

@@ -8,14 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from serving import Serve
+from serving import ROOT, Serve
 
 from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.scan import ScanPair
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="session")
@@ -38,8 +36,10 @@ def serving(pair_files: Path) -> Iterator[Serve]:
     pytest.importorskip("bokeh", reason="the library bokeh is not installed (extra `annotate`)")
     started: list[subprocess.Popen[str]] = []
 
-    def start(output: Path) -> tuple[subprocess.Popen[str], str]:
-        command = [sys.executable, "-m", "torchcrf_scan", "annotate", str(pair_files), "--output", str(output), "--threads=1"]
+    def start(output: Path, *options: str, files: Path = pair_files, full: Path | None = None) -> tuple[subprocess.Popen[str], str]:
+        """full: a file; while it is there the disk is full."""
+        program = ["-m", "torchcrf_scan"] if full is None else [str(Path(__file__).with_name("full_disk.py")), str(full)]
+        command = [sys.executable, *program, "annotate", str(files), "--output", str(output), "--threads=1", *options]
         process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         started.append(process)
         assert process.stdout is not None

@@ -209,8 +209,12 @@ def test_the_proposal_is_the_models_answer() -> None:
     document = proposed(SCANS, prediction)
     assert np.array_equal(document.motions, motions)
     assert document.label.tolist() == truth.cluster[PAIR.source.beam].tolist()
-    assert_same(annotated(SCANS, annotation_of(document), prediction), document)
-    assert annotated(SCANS, annotation_of(document)).held.all()
+    assert document.held.all()
+    assert_same(annotated(SCANS, annotation_of(document)), document)
+    changed = assign(document, np.flatnonzero(IS_BOX)[:5], OUTLIER)
+    assert np.array_equal(changed.motions, motions)
+    np.testing.assert_allclose(fit_again(changed, 1).motions[1], labelled().motions[1], atol=5e-3)
+    assert assign(changed, np.flatnonzero(IS_BOX)[:5], new_mover(changed)).held.tolist() == [True, True, False]
 
 
 def test_a_pair_annotated_as_its_truth_says_gives_the_truth(pairs: list[ScanPair]) -> None:

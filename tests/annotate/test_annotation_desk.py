@@ -8,24 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worked import case, cases
 
-from torchcrf_scan.annotate.desk import PAUSE, Case, Desk
+from torchcrf_scan.annotate.desk import PAUSE, Desk
 from torchcrf_scan.annotate.document import assign, drag
 from torchcrf_scan.annotate.queue import confidence_of, neighbour, order
 from torchcrf_scan.annotate.store import Progress, Store
 from torchcrf_scan.data.pair_file import read_pair, write_pair
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 
-
-def case(name: str, confidence: float, shift: float = 0.0) -> Case:
-    """A wall seen twice, of which the model is as sure as told."""
-    scan = Scan.from_ranges(np.linspace(3, 4, 30) + shift, np.linspace(-0.5, 0.5, 30), range_noise=0.01)
-    beams, sure = np.arange(30), np.full(30, confidence)
-    answer = PairPrediction(beams, np.zeros(30, np.int64), np.zeros((1, 3)), sure, sure, True)
-    return Case(ScanPair(scan, scan, 0.1, name=name, sequence="wall"), answer)
-
-
-CASES = [case("sure", 0.9), case("unsure", 0.2), case("middling", 0.5)]
+CASES = cases()
 
 
 def a_change(desk: Desk) -> None:
@@ -36,6 +28,11 @@ def body(path: Path) -> list[int]:
     annotation = read_pair(path).annotation
     assert annotation is not None
     return annotation.body.tolist()
+
+
+def left_over(folder: Path) -> list[Path]:
+    """Files that are not whole yet."""
+    return [path for path in folder.rglob(".*") if path.is_file()]
 
 
 def test_the_least_sure_comes_first_and_what_is_done_last(tmp_path: Path) -> None:
@@ -68,7 +65,7 @@ def test_order_and_confidence_without_answers_or_points() -> None:
 def test_every_change_is_on_the_disk_and_older_ones_are_kept(tmp_path: Path) -> None:
     store = Store(tmp_path)
     desk = Desk(CASES, store)
-    path = store.path("unsure")
+    path = store.unfinished("unsure")
     assert not path.exists()
     a_change(desk)
     first = path.read_bytes()
@@ -84,7 +81,7 @@ def test_every_change_is_on_the_disk_and_older_ones_are_kept(tmp_path: Path) -> 
     assert np.array_equal(again.document.label, desk.document.label)
     assert np.array_equal(again.document.motions, desk.document.motions)
     assert again.document.held.tolist() == [True]
-    assert not [file for file in tmp_path.iterdir() if file.name.startswith(".")]
+    assert not left_over(tmp_path)
 
 
 def test_a_damaged_file_gives_way_to_the_version_before(tmp_path: Path) -> None:
@@ -93,9 +90,9 @@ def test_a_damaged_file_gives_way_to_the_version_before(tmp_path: Path) -> None:
     a_change(desk)
     label = desk.document.label
     desk.change(assign(desk.document, np.arange(30), -2))
-    store.path("unsure").write_bytes(b"half a fi")
+    store.unfinished("unsure").write_bytes(b"half a fi")
     assert np.array_equal(Desk(CASES, store).document.label, label)
-    (tmp_path / "progress.json").write_text("{")
+    (tmp_path / ".annotate" / "progress.json").write_text("{")
     assert Desk(CASES, store).progress.done == []
 
 
@@ -103,7 +100,7 @@ def test_a_full_disk_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     store = Store(tmp_path)
     desk = Desk(CASES, store)
     a_change(desk)
-    before = store.path("unsure").read_bytes()
+    before = store.unfinished("unsure").read_bytes()
 
     def full(number: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -112,7 +109,7 @@ def test_a_full_disk_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         patch.setattr(os, "fsync", full)
         desk.change(assign(desk.document, np.arange(10), -2))
         assert "No space left on device" in desk.error
-        assert store.path("unsure").read_bytes() == before
+        assert store.unfinished("unsure").read_bytes() == before
         desk.finish()
         assert desk.name == "unsure"
         assert desk.progress.done == []
@@ -121,8 +118,8 @@ def test_a_full_disk_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert desk.error
     desk.save()
     assert not desk.error
-    assert body(store.path("unsure")) == [-1] * 10 + [0] * 20
-    assert not [file for file in tmp_path.iterdir() if file.name.startswith(".")]
+    assert body(store.unfinished("unsure")) == [-1] * 10 + [0] * 20
+    assert not left_over(tmp_path)
 
 
 def test_minutes_without_the_pauses(tmp_path: Path) -> None:
@@ -133,7 +130,7 @@ def test_minutes_without_the_pauses(tmp_path: Path) -> None:
         a_change(desk)
     desk.finish()
     assert desk.minutes == pytest.approx((30 + PAUSE) / 60)
-    assert json.loads((tmp_path / "progress.json").read_text()) == {"seconds": {"unsure": 90.0}, "done": ["unsure"]}
+    assert json.loads((tmp_path / ".annotate" / "progress.json").read_text()) == {"seconds": {"unsure": 90.0}, "done": ["unsure"]}
     assert Store(tmp_path).read_progress() == Progress({"unsure": 90.0}, ["unsure"])
 
 

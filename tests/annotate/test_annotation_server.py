@@ -1,5 +1,6 @@
 """The command and its server: who is answered, what is refused, and what is told in one line."""
 
+import subprocess
 import sys
 from contextlib import closing
 from http.client import HTTPConnection
@@ -7,8 +8,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from serving import ROOT, Serve, saved, shown, window
 
-from torchcrf_scan.annotate.keys import ACTIONS
 from torchcrf_scan.cli import main
 
 
@@ -42,14 +43,6 @@ def test_the_page_loads_nothing_from_elsewhere(address: str) -> None:
     assert "https://" not in page
 
 
-def test_every_key_has_its_action() -> None:
-    pytest.importorskip("bokeh", reason="the library bokeh is not installed (extra `annotate`)")
-    from torchcrf_scan.annotate.page import BUTTONS, Page
-
-    assert all(callable(getattr(Page, f"_{action}")) for action in ACTIONS.values())
-    assert {key for row in BUTTONS for _, key in row} <= set(ACTIONS)
-
-
 def test_wrong_arguments_are_told(pair_files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("bokeh", reason="the library bokeh is not installed (extra `annotate`)")
 
@@ -60,6 +53,53 @@ def test_wrong_arguments_are_told(pair_files: Path, tmp_path: Path, capsys: pyte
     assert "--output: expected another folder than that of the pairs" in error("--output", str(pair_files))
     assert "--port: expected 0 to 65535, got 70000" in error("--output", str(tmp_path), "--port=70000")
     assert "--outlier_distance: expected metres above 0" in error("--output", str(tmp_path), "--outlier_distance=0")
+
+
+def test_the_page_is_opened_in_the_browser_if_wanted(
+    pair_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    server = pytest.importorskip("torchcrf_scan.annotate.server", reason="the library bokeh is not installed (extra `annotate`)")
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr(server, "serve", lambda server: server.stop())
+    one = sorted(pair_files.glob("*.npz"))[0]
+    assert main(["annotate", str(one), "--output", str(tmp_path)]) == 0
+    assert opened == []
+    assert main(["annotate", str(one), "--output", str(tmp_path), "--open"]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[1].startswith("1 pair, annotations in ")
+    assert opened == [told[1].split()[-1]]
+
+
+def test_a_log_is_annotated_and_learned_from(serve: Serve, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From the log to the files, which `evaluate` and `train.py` take, without one that was begun but not finished."""
+    log, output = tmp_path / "drive.csv", tmp_path / "annotated"
+    assert main(["simulate", "--output", str(log), "--drive=13", "--simulator.beams=91", "--seed=3"]) == 0
+    process, address = serve(output, "--every=3", files=log)
+    names = {f"drive_{k:05d}" for k in (0, 3, 6, 9)}
+    finished: list[str] = []
+    with window(address) as keys:
+        for _ in range(3):
+            finished.append(shown(address))
+            keys.press(".", "o", "Enter")
+        begun = shown(address)
+        keys.press(".", "u")
+        assert saved(output, begun).ignore.any()
+    assert {*finished, begun} == names
+    assert {path.name for path in output.iterdir()} == {".annotate", *(f"{name}.npz" for name in finished)}
+    for name in finished:
+        assert (saved(output, name).body == -1).any()
+    assert main(["annotate", str(log), "--output", str(output)]) == 1
+    assert "expected nobody at work here" in capsys.readouterr().err
+    process.kill()
+    process.wait()
+    assert main(["evaluate", str(output)]) == 0
+    assert "**Overview**" in capsys.readouterr().out
+    tiny = ["--learning.max_steps=2", "--learning.booster_examples=200", "--learning.folds=0"]
+    config = ["--config", str(ROOT / "configs" / "mine.yaml"), "--data.train", str(output), "--output", str(tmp_path / "run")]
+    done = subprocess.run([sys.executable, "train.py", *config, *tiny], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert (tmp_path / "run" / "model").is_dir()
 
 
 def test_a_missing_library_is_told(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data import pair_file
 from torchcrf_scan.data.pair_file import read_pair, read_prediction, write_pair, write_prediction
+from torchcrf_scan.safe_names import UNPRINTABLE
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
 
 NO_RETURNS = (np.nan, np.inf, 0.0, -1.0, 0.05, 29.96, 30.0, 81.9)  # for range_min = 0.1, range_max = 30
@@ -84,7 +85,7 @@ def scans(draw: st.DrawFn) -> Scan:
 def pairs(draw: st.DrawFn) -> ScanPair:
     source, target = draw(scans()), draw(scans())
     annotation = draw(st.none() | annotations(source, target))
-    text = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=5)
+    text = st.text(st.characters(codec="utf-8", exclude_categories=tuple(UNPRINTABLE)), max_size=5)
     return ScanPair(source, target, draw(st.floats(0.01, 2.0)), annotation, draw(text), "pair", draw(text))
 
 

@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from forked import run_ranks
-from hypothesis import given
-from hypothesis import strategies as st
 from made_up import RIVAL, Recorder, guess, make_pairs, make_study
 
 from torchcrf_scan.experiment import cross_validation
-from torchcrf_scan.experiment.cross_validation import SECONDS, Fold, cores, file_name, make_folds, read_folds, run_folds, write_fold
+from torchcrf_scan.experiment.cross_validation import SECONDS, Fold, cores, make_folds, read_folds, run_folds, write_fold
 from torchcrf_scan.experiment.methods import METHODS, Answer
 from torchcrf_scan.experiment.models import JOINT
 from torchcrf_scan.experiment.settings import RunConfig
+from torchcrf_scan.safe_names import file_name
 from torchcrf_scan.scan import ScanPair
 
 BY_PAIR, BY_SEQUENCE = "leave_one_pair_out", "leave_one_sequence_out"
@@ -64,40 +63,19 @@ def test_one_thing_cannot_be_left_out(protocol: str, sequences: str) -> None:
         make_folds(protocol, make_pairs(*sequences, "x"), len(sequences))
 
 
-def test_names_that_one_cannot_tell_apart_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected names that differ as file names, got a/b, a b"):
-        make_folds(BY_SEQUENCE, make_pairs("a/b", "a b", "c"), 3)
+def test_pairs_of_the_same_name_are_refused() -> None:
     twice = [*make_pairs("a", "b"), *make_pairs("c")]
     for protocol in (BY_PAIR, BY_SEQUENCE):
-        with pytest.raises(ValueError, match="expected names that differ as file names, got pair 0, pair 0"):
+        with pytest.raises(ValueError, match="expected pair names that differ, got twice pair 0"):
             make_folds(protocol, twice, 3)
     assert len(make_folds(BY_SEQUENCE, twice, 2)) == 2  # what is only trained on leaves nothing behind
 
 
-def test_file_names() -> None:
-    assert file_name("K-Means (ICP), ego removed") == "K-Means_ICP_ego_removed"
-    assert file_name("../..") == ".._.."
-    assert file_name("/") == file_name("") == "unnamed"
-
-
-@given(st.text() | st.sampled_from([".", "..", "...", "./.", "x" * 300, "\u00e9" * 200]))
-def test_a_file_name_stays_in_its_folder(name: str) -> None:
-    found = file_name(name)
-    assert "/" not in found
-    assert found.strip(".")
-    assert len(found.encode()) <= 200  # of 255, an ending being added
-    assert found == file_name(name)
-
-
-def test_long_names_that_begin_alike_differ() -> None:
-    assert file_name("x" * 300) != file_name("x" * 301)
-    assert file_name("x" * 100) == "x" * 100
-
-
-@pytest.mark.parametrize("last", ["..", "."])
-def test_a_sequence_named_like_a_folder_gets_a_name_of_its_own(last: str) -> None:
-    assert [fold.name for fold in make_folds(BY_SEQUENCE, make_pairs("a", "b", last), 3)] == ["a", "b", "unnamed"]
-    assert len({file_name(method) for method in METHODS}) == len(METHODS)
+def test_sequences_named_like_folders_or_each_other_get_folders_of_their_own() -> None:
+    sequences = ["a", "a b", "a/b", ".", "..", ""]
+    folds = [fold.name for fold in make_folds(BY_SEQUENCE, make_pairs(*sequences), len(sequences))]
+    assert folds == [file_name(sequence) for sequence in sequences]
+    assert len({*folds}) == len(sequences)
 
 
 # --- running ------------------------------------------------------------------------------------------------------------------

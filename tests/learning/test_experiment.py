@@ -158,8 +158,8 @@ def test_a_run_leaves_tables_figures_and_events(
         assert all(table.to_markdown() in text for table in of_protocol)
         assert len(list((tmp_path / "run" / "tables").glob(f"{protocol}_*.csv"))) == len(of_protocol)
         pictures = {path.stem for path in (tmp_path / "run" / "figures" / protocol).iterdir()}
-        drawn = {f"{kind}_pair_{k}" for kind in ("associations", "clusters") for k in (0, 2, 3)}
-        assert pictures == drawn | {"loss_pair_2", "loss_pair_3"}  # pairs where `joint` makes more mistakes than its rival
+        drawn = {f"{kind}_pair {k}" for kind in ("associations", "clusters") for k in (0, 2, 3)}
+        assert pictures == drawn | {"loss_pair 2", "loss_pair 3"}  # pairs where `joint` makes more mistakes than its rival
     events = EventAccumulator(str(tmp_path / "run" / "events"), size_guidance={"images": 0, "tensors": 0})
     events.Reload()
     tags = events.Tags()
@@ -170,7 +170,7 @@ def test_a_run_leaves_tables_figures_and_events(
     assert len(recorder.trained) == 7
     both = [[table.to_markdown() for table in of["leave_one_sequence_out"]] for of in (tables, again)]
     assert both[0] == both[1]
-    assert (tmp_path / "run" / "figures" / "leave_one_sequence_out" / "clusters_pair_1.png").is_file()
+    assert (tmp_path / "run" / "figures" / "leave_one_sequence_out" / "clusters_pair 1.png").is_file()
 
 
 def test_a_run_that_cannot_be_leaves_nothing(pair_files: Callable[..., RunConfig], tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from torchcrf_scan.annotate.history import History
 from torchcrf_scan.annotate.queue import confidence_of, neighbour, order
 from torchcrf_scan.annotate.store import Store
 from torchcrf_scan.errors import TorchCRFScanError
+from torchcrf_scan.safe_names import one_line
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 
 PAUSE = 60.0  # seconds without a change after which nobody is at work
@@ -55,7 +56,12 @@ class Desk:
         for name, case in self.cases.items():
             saved = store.read(name)
             if saved is not None and not (_is_same(saved.source, case.pair.source) and _is_same(saved.target, case.pair.target)):
-                raise TorchCRFScanError(f"{store.folder}: expected annotations of these scans, got {store.path(name)} of others")
+                raise TorchCRFScanError(
+                    f"{store.folder}: expected annotations of these scans, got {store.finished(name).name} of others"
+                )
+            is_finished = saved is not None and saved.annotation is not None and store.finished(name).exists()
+            if is_finished and name not in self.progress.done:  # killed before it was noted
+                self.progress.done.append(name)
         self.name = self.ring[0]
         self._open()
 
@@ -95,29 +101,29 @@ class Desk:
         self.save()
 
     def finish(self) -> None:
-        """Saves the open pair as done and opens the next one; stays if it cannot be saved."""
+        """Puts the open pair among those finished and opens the next one; stays if it cannot be saved."""
         self._count()
-        self._unsaved.add(self.name)
-        done = self.progress.done
-        self.progress.done = [*(name for name in done if name != self.name), self.name]
-        self.save()
-        if self.error:
-            self.progress.done = done
-        else:
+        if self.name not in self.progress.done:
+            self._unsaved.add(self.name)
+        self.save(self.name)
+        if not self.error:
             self.name = self.ring[0]
             self._open()
 
-    def save(self) -> None:
-        """Writes what is not yet written; `error` says what could not be."""
+    def save(self, finished: str | None = None) -> None:
+        """Writes what is not yet written; `error` says what could not be. finished: a pair that is."""
         self.error = ""
         try:
             for name in sorted(self._unsaved):
                 document = self._histories[name].present
                 self.store.write(name, replace(self.cases[name].pair, annotation=annotation_of(document)))
                 self._unsaved.discard(name)
+            if finished is not None:
+                self.store.finish(finished)
+                self.progress.done = [*(name for name in self.progress.done if name != finished), finished]
             self.store.write_progress(self.progress)
         except (OSError, ValueError) as error:
-            self.error = " ".join(str(error).split())
+            self.error = one_line(error)
 
     @property
     def minutes(self) -> float:
@@ -129,6 +135,7 @@ class Desk:
         if history is not self._histories[self.name]:
             self._histories[self.name] = history
             self._unsaved.add(self.name)
+            self.progress.done = [name for name in self.progress.done if name != self.name]
         self.save()
 
     def _count(self) -> None:
@@ -144,7 +151,7 @@ class Desk:
         case, saved = self.cases[self.name], self.store.read(self.name)
         scans = Scans.of(case.pair, self._gate)
         if saved is not None and saved.annotation is not None:
-            document = annotated(scans, saved.annotation, case.prediction)
+            document = annotated(scans, saved.annotation)
         else:
             document = blank(scans) if case.prediction is None else proposed(scans, case.prediction)
         self._histories[self.name] = History(document)

@@ -17,7 +17,7 @@ from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, I
 
 UNKNOWN = -2  # label of points that nobody annotated, `ignore` in a file
 MOST_MOVERS = 30
-SAME = 1e-6  # radians or metres; a motion this near to the fitted one was not set by hand
+SAME = 1e-6  # radians or metres; a motion this near to the fitted one was fitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +28,7 @@ class Document:
         scans: the points.
         label: (N,) 0 background, k >= 1 mover k, -1 outlier, -2 unknown.
         motions: (K+1, 3) `T_target_source`, NaN for movers that are not there.
-        held: (K+1,) bool, motions set by hand: they are not fitted.
+        held: (K+1,) bool, motions that are not fitted: set by hand, or the model's.
         mended: (N,) target points given by hand, -1 none, `FOLLOWS` where the association follows from the motion.
         is_line: motions are fitted point-to-line, else by Kabsch.
     """
@@ -70,14 +70,14 @@ def blank(scans: Scans) -> Document:
 
 
 def proposed(scans: Scans, prediction: PairPrediction) -> Document:
-    """The model's clusters and motions; these are fitted as soon as their points change."""
+    """The model's clusters and motions. These are held: with true labels they are nearer to the true motions than a fit is."""
     label = prediction.cluster[scans.pair.source.beam]
     motions = np.asarray(prediction.motions, np.float64)
-    return replace(blank(scans), label=label, motions=motions, held=np.zeros(len(motions), dtype=bool))
+    return replace(blank(scans), label=label, motions=motions, held=np.isfinite(motions[:, 0]))
 
 
-def annotated(scans: Scans, annotation: Annotation, prediction: PairPrediction | None = None) -> Document:
-    """The document of an annotation. What the motions do not explain, nor the fit or the model them, counts as done by hand."""
+def annotated(scans: Scans, annotation: Annotation) -> Document:
+    """The document of an annotation: associations that do not follow from motions are mended, motions that no fit gives held."""
     beam = scans.pair.source.beam
     body = np.where(annotation.cluster >= BACKGROUND, annotation.cluster, annotation.body)[beam]
     label = np.where(annotation.ignore[beam], UNKNOWN, body)
@@ -90,11 +90,7 @@ def annotated(scans: Scans, annotation: Annotation, prediction: PairPrediction |
     document = _fitted(document, np.flatnonzero(np.isnan(annotation.motions[:, 0])).tolist())
     follows = replace(document, mended=np.full(len(label), FOLLOWS)).association
     document = replace(document, mended=np.where(association == follows, FOLLOWS, association))
-    fitted = _fitted(document, range(len(motions))).motions
-    apart = np.abs(fitted - document.motions).max(-1)
-    if prediction is not None:
-        to_models = np.abs(document.motions[:, None] - prediction.motions).max(-1)  # (K+1, of the model)
-        apart = np.fmin(apart, to_models.min(-1))
+    apart = np.abs(_fitted(document, range(len(motions))).motions - document.motions).max(-1)
     return replace(document, held=apart > SAME)
 
 
@@ -174,6 +170,12 @@ def mend(document: Document, points: Ints, targets: Ints) -> Document:
     mended[points[is_body]] = np.broadcast_to(targets, points.shape)[is_body]
     concerned = np.unique(document.label[points[is_body]]).tolist()
     return _fitted(replace(document, mended=mended), concerned)
+
+
+def beside(document: Document, points: Ints, step: int) -> Ints:
+    """The target points so many places after those that points are associated with; -1 for outliers."""
+    association, last = document.association[points], len(document.scans.pair.target) - 1
+    return np.where(association == OUTLIER, OUTLIER, np.clip(association + step, 0, last))
 
 
 def surface(document: Document, points: Ints) -> Ints:

@@ -23,7 +23,7 @@ KEYS: Mapping[tuple[str, ...], tuple[str, str, str]] = {
     ("[", "]", "{", "}"): ("[ ]", "turn", "turn it 0.1&deg;, Shift 1&deg;"),
     ("f",): ("f", "fit", "fit it again, from farther off"),
     ("k",): ("k", "metric", "point-to-line or Kabsch"),
-    ("a",): ("a", "associate", "tie selection to selected ring"),
+    ("a",): ("a", "associate", "tie selection to the ring at the mouse"),
     ("<", ">"): ("&lt; &gt;", "shift", "tie to ring before, after"),
     ("x",): ("x", "part", "no counterpart"),
     ("r",): ("r", "release", "tie as the motion says"),
@@ -40,7 +40,10 @@ KEYS: Mapping[tuple[str, ...], tuple[str, str, str]] = {
 ACTIONS: Mapping[str, str] = {key: action for keys, (_, action, _) in KEYS.items() for key in keys}
 
 
+MARKS = "Rings: second scan. Dots and crosses: first scan, moved. Dotted circles: the model is unsure. Lines: associations."
+
+
 def legend() -> str:
-    """The keys as HTML, in two columns."""
+    """The marks and keys as HTML, the keys in two columns."""
     rows = "".join(f"<div><kbd>{shown}</kbd> {meaning}</div>" for shown, _, meaning in KEYS.values())
-    return f"<div style='column-count:2; column-gap:12px'>{rows}</div>"
+    return f"<div style='margin-bottom:6px'>{MARKS}</div><div style='column-count:2; column-gap:12px'>{rows}</div>"

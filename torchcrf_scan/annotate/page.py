@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any
 
 import numpy as np
 from bokeh.document import Document as BokehDocument
-from bokeh.events import ConnectionLost, DocumentReady, Pan, PanEnd, PanStart
+from bokeh.events import ConnectionLost, DocumentReady, MouseMove, Pan, PanEnd, PanStart
 from bokeh.layouts import column, row
 from bokeh.models import CustomJS
 from bokeh.models.widgets.buttons import Button
@@ -24,6 +24,7 @@ from torchcrf_scan.annotate.keys import ACTIONS, legend
 from torchcrf_scan.annotate.picture import Picture, look
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry.velocity import ground_velocity
+from torchcrf_scan.safe_names import one_line
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints
 from torchcrf_scan.viz.marks import NOTE, WRONG
 
@@ -32,9 +33,10 @@ MODE_KEYS = {"l": 0, "m": 1, "p": 2}
 WIDTH = 390  # pixels of what stands beside the picture
 NUDGE, TURN, FAST = 0.01, math.radians(0.1), 10.0  # metres, radians; with Shift so many times more
 AGAIN = 5000  # milliseconds after which what could not be saved is tried once more
-ARROWS = {"ArrowLeft": (-1, 0), "ArrowRight": (1, 0), "ArrowUp": (0, 1), "ArrowDown": (0, -1)}
+ARROWS = {"ArrowLeft": (0, -1, 0), "ArrowRight": (0, 1, 0), "ArrowUp": (0, 0, 1), "ArrowDown": (0, 0, -1)}
+TURNS = {"[": (1, 0, 0), "{": (1, 0, 0), "]": (-1, 0, 0), "}": (-1, 0, 0)}
 TABLE = """
-td { padding: 1px 7px 1px 0; white-space: nowrap } div { line-height: 1.35 }
+table { border-collapse: collapse } td { padding: 1px 7px 1px 0; white-space: nowrap } div { line-height: 1.35 }
 kbd { background: #EEF0F2; border-radius: 3px; padding: 0 4px }
 """
 PRESS = """
@@ -46,9 +48,10 @@ document.addEventListener("keydown", (event) => {
   if (key in modes) return group.active = modes[key]
   const look = zooms[key] ?? (group.active == 2 ? pans[key] : undefined)
   if (look !== undefined) return look.do.emit()
-  box.tags = [key, event.shiftKey, (box.tags[2] ?? 0) + 1]
+  box.tags = [key, event.shiftKey, (box.tags[2] ?? 0) + 1, window.mouse ?? null]
 })
 """
+MOVED = "window.mouse = [cb_obj.x, cb_obj.y]"  # metres
 MODE = "lasso.active = group.active == 0; pan.active = group.active == 2"
 LOST = (
     "error.text = 'The server is gone. Everything up to the last change is saved: start the command again, then reload this page.'"
@@ -73,12 +76,13 @@ class Page:
     def __init__(self, doc: BokehDocument, desk: Desk, changed: Callable[[Page], None]) -> None:
         self.doc, self.desk, self._changed = doc, desk, changed
         self.active, self.message, self.is_own, self._shown = BACKGROUND, "", True, ""
-        self._grabbed: tuple[Document, Floats] | None = None
+        self._grabbed: Floats | None = None  # where a drag began
+        self.mouse: Sequence[float] | None = None
         self.picture = Picture()
         self.mode = RadioButtonGroup(labels=list(MODES), active=0, width=WIDTH)
         parts = (Div(width=WIDTH, stylesheets=[TABLE], name=name) for name in ("title", "error", "bodies"))
         self.title, self.error, self.bodies = parts
-        self.error.styles = {"color": WRONG, "font-weight": "bold"}
+        self.error.styles = {"color": WRONG, "font-weight": "bold", "min-height": "34px"}  # nothing below jumps
         self.box = Div(visible=False, name="keys", tags=["", False, 0])
         self._connect()
         rows = [row([self._button(*button) for button in buttons]) for buttons in BUTTONS]
@@ -93,16 +97,11 @@ class Page:
         plot, picture = self.picture.figure, self.picture
         for event, answer in ((PanStart, self._grab), (Pan, self._pull), (PanEnd, self._drop)):
             plot.on_event(event, answer)
-        self.box.on_change("tags", lambda _attribute, _old, new: self.press(new[0], bool(new[1])))
+        plot.js_on_event(MouseMove, CustomJS(code=MOVED))
+        self.box.on_change("tags", lambda _attribute, _old, new: self.press(*new[:2], *new[3:]))
         self.mode.js_on_change("active", CustomJS(args={"group": self.mode, "lasso": picture.lasso, "pan": picture.pan}, code=MODE))
-        press = {
-            "modes": MODE_KEYS,
-            "box": self.box,
-            "group": self.mode,
-            "zooms": picture.zooms,
-            "pans": picture.pans,
-            "known": list(ACTIONS),
-        }
+        press = {"known": list(ACTIONS), "modes": MODE_KEYS, "group": self.mode, "box": self.box}
+        press |= {"zooms": picture.zooms, "pans": picture.pans}
         self.doc.js_on_event(DocumentReady, CustomJS(args=press, code=PRESS))
         self.doc.js_on_event(ConnectionLost, CustomJS(args={"error": self.error}, code=LOST))
         self.doc.add_periodic_callback(self._retry, AGAIN)
@@ -112,17 +111,18 @@ class Page:
         button.on_click(lambda: self.press(key))
         return button
 
-    def press(self, key: str, is_fast: bool = False) -> None:
-        """Does what a key stands for. is_fast: with Shift."""
+    def press(self, key: str, is_fast: bool = False, mouse: Sequence[float] | None = None) -> None:
+        """Does what a key stands for. is_fast: with Shift. mouse: where it is, metres; None: not over the picture so far."""
         if key not in ACTIONS:
             return
-        self.message, before = "", self.desk.document
+        self.message, self.mouse = "", mouse
         try:
-            getattr(self, f"_{ACTIONS[key]}")(key, is_fast)
+            if self._shown != self.desk.name:  # what is selected here is of another pair
+                raise TorchCRFScanError("another window has opened this pair")
+            self._act(ACTIONS[key], key, is_fast)
         except ValueError as error:
-            self.message = str(error)
-        if self.desk.document is not before or self.desk.name != self._shown:
-            self._changed(self)
+            self.message = one_line(error)
+        self._changed(self)
         self.draw()
 
     def draw(self) -> None:
@@ -140,10 +140,10 @@ class Page:
     def _tell(self, document: Document) -> None:
         desk, name = self.desk, self.desk.name
         done, ring = desk.progress.done, desk.ring
-        told = f"<b>{len(done)} of {len(ring)} pairs done</b>, {desk.minutes:.1f} minutes a pair"
+        told = f"<b>{len(done)} of {len(ring)} done</b>, {desk.minutes:.1f} minutes a pair"
         here = f"number {ring.index(name) + 1} in line, confidence {desk.confidences[name]:.2f}"
         self.title.text = f"{told}<br><b>{escape(name)}</b>{' (done)' if name in done else ''}: {here}"
-        saved = f"Not saved, tried again: {desk.error}" if desk.error else ""
+        saved = f"Not saved, tried again every {AGAIN // 1000} s: {desk.error}" if desk.error else ""
         self.error.text = escape(saved or self.message)
         metric = "point-to-line" if document.is_line else "Kabsch"
         rows = "".join(self._row(document, k) for k in (BACKGROUND, *document.movers, OUTLIER, UNKNOWN))
@@ -164,14 +164,14 @@ class Page:
                 centre, pair = document.scans.source[points].mean(axis=0), document.scans.pair
                 velocity = ground_velocity(centre, document.motions[k], document.motions[BACKGROUND], pair.dt)
                 cells[3] = f"{np.linalg.norm(velocity):.2f} m/s"
-        cells[4] = "by hand" if k >= BACKGROUND and document.held[k] else ""
+        if k >= BACKGROUND and document.held[k]:
+            is_models = self.desk.prediction is not None and (document.motions[k] == self.desk.prediction.motions).all(-1).any()
+            cells[4] = "model's motion" if is_models else "moved by hand"
         shape = {"x": "&#10005;", "square": "&#9632;", "diamond": "&#9670;", "triangle": "&#9650;", "inverted_triangle": "&#9660;"}
         color, marker = look(k)
         mark = f"<span style='color:{color};-webkit-text-stroke:0.5px {NOTE}'>{shape.get(marker, '&#9679;')}</span>"
         weight = "background:#DDE6EE" if k == self.active else ""
         return f"<tr style='{weight}'><td>{mark}</td>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
-
-    # Selection, modes and view
 
     @property
     def chosen(self) -> Ints:
@@ -179,72 +179,83 @@ class Page:
         n = len(self.desk.document.label)
         return np.array(sorted(i for i in self.picture.source.selected.indices if 0 <= i < n), dtype=np.int64)
 
-    def _browser(self, key: str, is_fast: bool) -> None:
-        """Modes and zoom: the browser has changed them itself."""
+    def _act(self, action: str, key: str, is_fast: bool) -> None:
+        """One action of `KEYS`; those of the browser have been done there."""
+        desk, document = self.desk, self.desk.document
+        bodies = [BACKGROUND, *document.movers]
+        active = self.active if self.active in bodies else BACKGROUND  # another window may have emptied it
+        step, angle = (size * (FAST if is_fast or key in "{}" else 1.0) for size in (NUDGE, TURN))
+        actions: Mapping[str, Callable[[], object]] = {
+            "browser": lambda: None,
+            "digit": lambda: self._digit(int(key), bodies),
+            "give_new": lambda: self._give(edit.new_mover(document), is_new=True),
+            "give_active": lambda: self._give(active),
+            "give_outlier": lambda: self._give(OUTLIER),
+            "give_unknown": lambda: self._give(UNKNOWN),
+            "step": lambda: self._step(1 if key == "." else -1),
+            "extend": lambda: self.picture.choose(edit.surface(document, self.chosen)),
+            "select_active": lambda: self.picture.choose(document.of(active)),
+            "clear": lambda: self.picture.choose(np.zeros(0, np.int64)),
+            "cycle": lambda: setattr(self, "active", bodies[(bodies.index(active) + 1) % len(bodies)]),
+            "arrow": lambda: desk.change(edit.drag(document, active, step * np.array(ARROWS[key]))),
+            "turn": lambda: desk.change(edit.drag(document, active, angle * np.array(TURNS[key]))),
+            "fit": lambda: desk.change(edit.fit_again(document, active)),
+            "metric": lambda: desk.change(edit.with_metric(document, not document.is_line)),
+            "associate": lambda: self._mend(self._ring()),
+            "shift": lambda: self._mend(edit.beside(document, self.chosen, 1 if key == ">" else -1)),
+            "part": lambda: self._mend(np.array([OUTLIER])),
+            "release": lambda: self._mend(np.array([FOLLOWS])),
+            "undo": desk.undo,
+            "redo": desk.redo,
+            "whole": lambda: self.picture.show_whole(document),
+            "closer": lambda: self.picture.show_body(document, active),
+            "view": lambda: setattr(self, "is_own", not self.is_own),
+            "finish": desk.finish,
+            "turn_page": lambda: desk.go(1 if key == "PageDown" else -1),
+        }
+        actions[action]()
 
-    def _step(self, key: str, is_fast: bool) -> None:
-        step, n, chosen = (1 if key == "." else -1), len(self.desk.document.label), self.chosen
+    def _digit(self, label: int, bodies: list[int]) -> None:
+        if len(self.chosen):
+            self._give(label)
+        elif label in bodies:
+            self.active = label
+
+    def _step(self, step: int) -> None:
+        """Selects the point after or before those selected."""
+        n, chosen = len(self.desk.document.label), self.chosen
         if n:
             self.picture.choose(np.array([(int(chosen[0 if step < 0 else -1]) + step) % n if len(chosen) else 0]))
 
-    def _extend(self, key: str, is_fast: bool) -> None:
-        self.picture.choose(edit.surface(self.desk.document, self.chosen))
-
-    def _select_active(self, key: str, is_fast: bool) -> None:
-        self.picture.choose(self.desk.document.of(self.active))
-
-    def _clear(self, key: str, is_fast: bool) -> None:
+    def _give(self, label: int, is_new: bool = False) -> None:
+        self.desk.change(edit.assign(self.desk.document, self._points(), label))
+        self.active = label if is_new else self.active
         self.picture.choose(np.zeros(0, np.int64))
 
-    def _cycle(self, key: str, is_fast: bool) -> None:
-        bodies = [BACKGROUND, *self.desk.document.movers]
-        self.active = bodies[(bodies.index(self.active) + 1) % len(bodies)]
+    def _mend(self, targets: Ints) -> None:
+        points = self._points()
+        if not (self.desk.document.label[points] >= BACKGROUND).any():
+            raise TorchCRFScanError("give these points to a body first: outliers and unknown ones are tied to nothing")
+        self.desk.change(edit.mend(self.desk.document, points, targets))
 
-    def _whole(self, key: str, is_fast: bool) -> None:
-        chosen = self.chosen
-        self.picture.open(self.desk.document)
-        self.picture.choose(chosen)
+    def _points(self) -> Ints:
+        """Those selected, at least one."""
+        if not len(self.chosen):
+            raise TorchCRFScanError("select points first: by lasso, click, or the keys , and .")
+        return self.chosen
 
-    def _closer(self, key: str, is_fast: bool) -> None:
-        points = self.desk.document.moved[self.desk.document.of(self.active)]
-        if len(points) and np.isfinite(points).all():
-            margin = 0.2 + 0.5 * np.ptp(points, axis=0).max()
-            self.picture.zoom_to(np.array([points.min(axis=0) - margin, points.max(axis=0) + margin]))
+    def _ring(self) -> Ints:
+        """(1,) the target point nearest to the mouse."""
+        target = self.desk.document.scans.target
+        if target is None or self.mouse is None:
+            raise TorchCRFScanError("point at a ring with the mouse")
+        return target.nearest(np.array([self.mouse]))[1]
 
-    def _view(self, key: str, is_fast: bool) -> None:
-        self.is_own = not self.is_own
-
-    # Labels
-
-    def _give(self, label: int) -> None:
-        self.desk.change(edit.assign(self.desk.document, self.chosen, label))
-        self.picture.choose(np.zeros(0, np.int64))
-
-    def _digit(self, key: str, is_fast: bool) -> None:
-        if len(self.chosen):
-            self._give(int(key))
-        elif int(key) in (BACKGROUND, *self.desk.document.movers):
-            self.active = int(key)
-
-    def _give_new(self, key: str, is_fast: bool) -> None:
-        if len(self.chosen):
-            self.active = edit.new_mover(self.desk.document)
-            self._give(self.active)
-
-    def _give_active(self, key: str, is_fast: bool) -> None:
-        self._give(self.active)
-
-    def _give_outlier(self, key: str, is_fast: bool) -> None:
-        self._give(OUTLIER)
-
-    def _give_unknown(self, key: str, is_fast: bool) -> None:
-        self._give(UNKNOWN)
-
-    # Motions
+    # The mouse
 
     def _grab(self, event: Any) -> None:
-        if self.mode.active == MODES.index("move"):
-            self._grabbed = self.desk.document, np.array([event.x, event.y])
+        if self.mode.active == MODES.index("move") and self._shown == self.desk.name:
+            self._grabbed = np.array([event.x, event.y])
 
     def _pull(self, event: Any) -> None:
         if self._grabbed is not None:
@@ -259,71 +270,18 @@ class Page:
 
     def _pulled(self, event: Any) -> Document:
         """The document while the active body is dragged: shifted, or turned about its centre."""
-        assert self._grabbed is not None
-        document, start = self._grabbed
-        here = np.array([event.x, event.y])
+        document, here = self.desk.document, np.array([event.x, event.y])  # another window may have changed it meanwhile
         if not (event.modifiers or {}).get("shift"):
-            return edit.drag(document, self.active, np.append(0.0, here - start))
+            return edit.drag(document, self.active, np.append(0.0, here - self._grabbed))
         points = document.moved[document.of(self.active)]
         if not len(points):
             return document
-        before, after = start - points.mean(axis=0), here - points.mean(axis=0)
-        turn = math.atan2(after[1], after[0]) - math.atan2(before[1], before[0])
+        (before_x, before_y), (x, y) = self._grabbed - points.mean(axis=0), here - points.mean(axis=0)
+        turn = math.atan2(y, x) - math.atan2(before_y, before_x)
         return edit.drag(document, self.active, np.array([turn, 0.0, 0.0]))
-
-    def _arrow(self, key: str, is_fast: bool) -> None:
-        x, y = ARROWS[key]
-        step = NUDGE * (FAST if is_fast else 1.0)
-        self.desk.change(edit.drag(self.desk.document, self.active, np.array([0.0, step * x, step * y])))
-
-    def _turn(self, key: str, is_fast: bool) -> None:
-        step = TURN * (FAST if key in "{}" else 1.0) * (1 if key in "[{" else -1)
-        self.desk.change(edit.drag(self.desk.document, self.active, np.array([step, 0.0, 0.0])))
-
-    def _fit(self, key: str, is_fast: bool) -> None:
-        self.desk.change(edit.fit_again(self.desk.document, self.active))
-
-    def _metric(self, key: str, is_fast: bool) -> None:
-        self.desk.change(edit.with_metric(self.desk.document, not self.desk.document.is_line))
-
-    # Associations
-
-    def _associate(self, key: str, is_fast: bool) -> None:
-        target = self.picture.target.selected.indices
-        if len(target) != 1 or not len(self.chosen):
-            raise TorchCRFScanError("select points, and with Shift one ring to associate them with")
-        self._mend(np.array(target))
-
-    def _shift(self, key: str, is_fast: bool) -> None:
-        association = self.desk.document.association[self.chosen]
-        last = len(self.desk.document.scans.pair.target) - 1
-        self._mend(np.where(association == OUTLIER, OUTLIER, np.clip(association + (1 if key == ">" else -1), 0, last)))
-
-    def _part(self, key: str, is_fast: bool) -> None:
-        self._mend(np.array([OUTLIER]))
-
-    def _release(self, key: str, is_fast: bool) -> None:
-        self._mend(np.array([FOLLOWS]))
-
-    def _mend(self, targets: Ints) -> None:
-        if len(self.chosen):
-            self.desk.change(edit.mend(self.desk.document, self.chosen, targets))
-
-    # Order and history
-
-    def _undo(self, key: str, is_fast: bool) -> None:
-        self.desk.undo()
-
-    def _redo(self, key: str, is_fast: bool) -> None:
-        self.desk.redo()
-
-    def _finish(self, key: str, is_fast: bool) -> None:
-        self.desk.finish()
-
-    def _turn_page(self, key: str, is_fast: bool) -> None:
-        self.desk.go(1 if key == "PageDown" else -1)
 
     def _retry(self) -> None:
         if self.desk.error:
             self.desk.save()
+            self._changed(self)
             self.draw()

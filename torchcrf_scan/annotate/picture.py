@@ -21,6 +21,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from torchcrf_scan.annotate.document import UNKNOWN, Document
+from torchcrf_scan.annotate.queue import sureness
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints, PairPrediction
 from torchcrf_scan.viz.marks import INK, NOTE, STATIC, WRONG, mover_look
@@ -44,7 +45,7 @@ class Picture:
 
     Attributes:
         figure: of bokeh. lasso, pan: its tools. zooms, pans: those that keys stand for.
-        source, target: tables of points, with what is selected in them.
+        source, target: tables of points, with what is selected in the first.
     """
 
     def __init__(self) -> None:
@@ -62,7 +63,7 @@ class Picture:
         frame = plot.scatter("x", "y", source=self._frame, size=0.1, alpha=0.0)
         for span in spans:
             span.renderers = [frame]
-        rings = plot.scatter("x", "y", source=self.target, size=10, fill_color=None, line_color=NOTE, line_width=1.2)
+        plot.scatter("x", "y", source=self.target, size=10, fill_color=None, line_color=NOTE, line_width=1.2)
         plot.segment("x0", "y0", "x1", "y1", source=self._links, color="color", line_width=2.5)
         plot.scatter("x", "y", source=self._doubts, size=17, fill_color=None, line_color=WRONG, line_dash="dotted", line_width=1.5)
         dots = plot.scatter(
@@ -70,12 +71,11 @@ class Picture:
         )
         plot.scatter([0], [0], marker="triangle", angle=-np.pi / 2, size=15, fill_color=INK, line_color="white")
         plot.text("x", "y", text="text", source=self._names, text_color="color", text_font_style="bold", x_offset=12, y_offset=-12)
-        for renderer in (rings, dots):  # the rest keeps its colours
-            renderer.nonselection_glyph = renderer.glyph
-            chosen = {name: getattr(renderer.glyph, name) for name in ("x", "y", "marker", "fill_color")}
-            renderer.selection_glyph = Scatter(**chosen, size=12, line_color=CHOSEN, line_width=2.5)
+        dots.nonselection_glyph = dots.glyph
+        chosen = {name: getattr(dots.glyph, name) for name in ("x", "y", "marker", "fill_color")}
+        dots.selection_glyph = Scatter(**chosen, size=12, line_color=CHOSEN, line_width=2.5)
         self.lasso, self.pan, wheel = LassoSelectTool(renderers=[dots]), PanTool(), WheelZoomTool()
-        plot.add_tools(self.lasso, self.pan, wheel, TapTool(renderers=[dots, rings]))
+        plot.add_tools(self.lasso, self.pan, wheel, TapTool(renderers=[dots]))
         plot.toolbar.active_scroll, plot.toolbar.active_drag = wheel, self.lasso
         larger, smaller = ZoomInTool(factor=0.2), ZoomOutTool(factor=0.2)
         self.zooms = {"+": larger, "=": larger, "-": smaller}
@@ -85,30 +85,38 @@ class Picture:
         self._frame.js_on_change("data", CustomJS(args={"plot": plot}, code="setTimeout(() => plot.reset.emit())"))
 
     def open(self, document: Document) -> None:
-        """Shows another pair: its target, and a window around both scans."""
+        """Shows another pair: its target, and all of it."""
         points = np.zeros((0, 2)) if document.scans.target is None else document.scans.target.points
         self.choose(np.zeros(0, np.int64))
         self.target.data = {"x": points[:, 0], "y": points[:, 1]}
-        window = make_scene(document.scans.pair, []).window
-        self.zoom_to(np.array(window))
+        self.show_whole(document)
 
-    def zoom_to(self, corners: Floats) -> None:
-        """A window around points (P, 2)."""
+    def show_whole(self, document: Document) -> None:
+        """A window around both scans."""
+        self._show(np.array(make_scene(document.scans.pair, []).window))
+
+    def show_body(self, document: Document, cluster: int) -> None:
+        """A window around a cluster."""
+        points = document.moved[document.of(cluster)]
+        if len(points) and np.isfinite(points).all():
+            margin = 0.2 + 0.5 * np.ptp(points, axis=0).max()
+            self._show(np.array([points.min(axis=0) - margin, points.max(axis=0) + margin]))
+
+    def _show(self, corners: Floats) -> None:
         self._frame.data = {"x": corners[:, 0], "y": corners[:, 1]}
 
     def choose(self, points: Ints) -> None:
-        """Selects points of the source, and no ring."""
-        self.target.selected.indices = []
+        """Selects points of the source."""
         self.source.selected.indices = points.tolist()
 
     def draw(self, document: Document, active: int, prediction: PairPrediction | None, is_own: bool) -> None:
         """Shows a document. is_own: every point under the motion of its body, else all under the background's."""
-        points = document.moved if is_own else se2.apply(document.motions[BACKGROUND], document.scans.source)
-        lost = np.isnan(points[:, 0])  # of a body whose motion is unknown
-        points = np.where(lost[:, None], se2.apply(document.motions[BACKGROUND], document.scans.source), points)
+        still = se2.apply(document.motions[BACKGROUND], document.scans.source)
+        is_moved = is_own & np.isfinite(document.moved)  # a body's motion may be unknown
+        points = np.where(is_moved, document.moved, still)
         self._draw_points(points, document)
         self._draw_links(points, document)
-        doubts = points[_doubtful(document, prediction)]
+        doubts = points[sureness(document.scans.pair, prediction) < DOUBTFUL]
         self._doubts.data = {"x": doubts[:, 0], "y": doubts[:, 1]}
         centres = [points[document.of(k)].mean(axis=0) for k in document.movers]
         x, y = np.reshape(centres, (-1, 2)).T
@@ -129,10 +137,3 @@ class Picture:
         (x0, y0), (x1, y1) = points[tied].T, there.T
         color = [look(k)[0] if k > BACKGROUND else NOTE for k in document.label[tied].tolist()]
         self._links.data = {"x0": x0, "y0": y0, "x1": x1, "y1": y1, "color": color}
-
-
-def _doubtful(document: Document, prediction: PairPrediction | None) -> Ints:
-    if prediction is None:
-        return np.zeros(0, np.int64)
-    both = np.minimum(prediction.association_confidence, prediction.cluster_confidence)
-    return np.flatnonzero(both[document.scans.pair.source.beam] < DOUBTFUL)

@@ -6,15 +6,19 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from torchcrf_scan.scan import PairPrediction, ScanPair
+from torchcrf_scan.scan import Floats, PairPrediction, ScanPair
+
+
+def sureness(pair: ScanPair, prediction: PairPrediction | None) -> Floats:
+    """(N,) the lesser confidence, in [0, 1], of each point's association and cluster; 1 without an answer."""
+    if prediction is None:
+        return np.ones(len(pair.source))
+    return np.minimum(prediction.association_confidence, prediction.cluster_confidence)[pair.source.beam]
 
 
 def confidence_of(pair: ScanPair, prediction: PairPrediction | None) -> float:
-    """Mean confidence, in [0, 1], of the points' associations and clusters; 1 for a pair without points, 0 without an answer."""
-    if prediction is None:
-        return 0.0
-    both = np.minimum(prediction.association_confidence, prediction.cluster_confidence)[pair.source.beam]
-    return float(both.mean()) if len(both) else 1.0
+    """Mean confidence of a pair's points; 1 for a pair without points, 0 without an answer."""
+    return 0.0 if prediction is None else float(np.mean(sureness(pair, prediction))) if len(pair.source) else 1.0
 
 
 def order(confidences: Mapping[str, float], done: Sequence[str]) -> list[str]:

@@ -37,9 +37,9 @@ def annotate(
 ) -> int:
     """Opens a page on 127.0.0.1 to annotate scan pairs by hand, starting from the model's answer: OUTPUT/<name of the pair>.npz.
 
-    Give points that the mouse or a key selects to the background, to movers, outliers or unknown; motions are fitted at once and
-    associations follow. The pair the model is least sure of comes first. Every change is saved at once, older versions are kept in
-    OUTPUT/versions; annotations already in OUTPUT are gone on with. Extra `annotate`: pip install torchcrf-scan[annotate].
+    Give points that the mouse or a key selects to the background, to movers, outliers or unknown; motions and associations follow.
+    The pair the model is least sure of comes first. Every change is saved at once, in OUTPUT/.annotate with the older versions
+    until the pair is finished; annotations already there are gone on with. Extra `annotate`: pip install torchcrf-scan[annotate].
 
     Args:
         files: pair files and logs
@@ -62,40 +62,37 @@ def annotate(
         from torchcrf_scan.annotate.server import ADDRESS, make_server, serve
     except ImportError as error:
         raise TorchCRFScanError(f"annotate: expected bokeh (pip install torchcrf-scan[annotate]), got {error}") from error
-    _check_numbers(port, outlier_distance)
     failures: list[str] = []
     left_out = LeftOut()
     places = find_pairs(files, every, failures, ReadOptions(topic, odometry, no_return, left_out.add))
     store = Store(make_folder("--output", output))
-    _check_apart(places, store)
-    cases = _cases(places, load_model(model, None, device, threads), failures)
-    for failure in failures:
-        print(f"torchcrf-scan annotate: error: {failure}", file=sys.stderr)
-    if not cases:
-        raise TorchCRFScanError(f"files: expected pairs to annotate, got none{left_out}")
-    server, port = make_server(Desk(cases, store, outlier_distance), port)
-    address = f"http://{ADDRESS}:{port}/"
-    print(f"{len(cases)} pairs, annotations in {output}, Ctrl-C ends{left_out}: {address}", flush=True)
-    if open:
-        webbrowser.open(address)
-    serve(server)
+    _check(port, outlier_distance, places, store)
+    with store.alone():
+        cases = _cases(places, load_model(model, None, device, threads), failures)
+        for failure in failures:
+            print(f"torchcrf-scan annotate: error: {failure}", file=sys.stderr)
+        if not cases:
+            raise TorchCRFScanError(f"files: expected pairs to annotate, got none{left_out}")
+        server, port = make_server(Desk(cases, store, outlier_distance), port)
+        address = f"http://{ADDRESS}:{port}/"
+        pairs = f"{len(cases)} pair{'s' if len(cases) > 1 else ''}"
+        print(f"{pairs}, annotations in {output}, Ctrl-C ends{left_out}: {address}", flush=True)
+        if open:
+            webbrowser.open(address)
+        serve(server)
     return 0
 
 
-def _check_numbers(port: int, outlier_distance: float | None) -> None:
-    """Raises ValueError for a port or a distance that cannot be."""
+def _check(port: int, outlier_distance: float | None, places: list[PairPlace], store: Store) -> None:
+    """Raises ValueError for a port or a distance that cannot be, or if an annotation would replace a file that it is made of."""
     if not 0 <= port < 1 << 16:
         raise TorchCRFScanError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
     if outlier_distance is not None and not 0 < outlier_distance < float("inf"):
         raise TorchCRFScanError(f"--outlier_distance: expected metres above 0, got {outlier_distance}")
-
-
-def _check_apart(places: list[PairPlace], store: Store) -> None:
-    """Raises ValueError if an annotation would replace a pair file that it is made of."""
     for place in places:
-        path = store.path(place.name)
-        if path.exists() and path.samefile(place.path):
-            raise TorchCRFScanError(f"--output: expected another folder than that of the pairs, got {store.folder}")
+        for path in (store.finished(place.name), store.unfinished(place.name)):
+            if path.exists() and path.samefile(place.path):
+                raise TorchCRFScanError(f"--output: expected another folder than that of the pairs, got {store.folder}")
 
 
 def _cases(places: list[PairPlace], network: JointScanCRF, failures: list[str]) -> list[Case]:

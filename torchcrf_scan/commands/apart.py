@@ -13,10 +13,10 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
 
-from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.commands.outputs import Add, Output
 from torchcrf_scan.commands.stopping import SIGNALS
 from torchcrf_scan.result import ScanResult
+from torchcrf_scan.safe_names import one_line
 
 WAITING = 200  # results at most that the process has not taken yet; some come while it begins
 

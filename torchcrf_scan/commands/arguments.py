@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from torchcrf_scan.commands.failures import attempt, one_line
+from torchcrf_scan.commands.failures import attempt
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.formats import PAIR, find_format, read_recording
 from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
@@ -17,6 +17,7 @@ from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.data.recording import Recording
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.safe_names import one_line
 from torchcrf_scan.scan import ScanPair
 
 Item = TypeVar("Item")

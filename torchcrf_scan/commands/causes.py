@@ -11,6 +11,7 @@ from torchcrf_scan.commands.arguments import batches, make_folder
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
 from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.safe_names import file_name
 from torchcrf_scan.scan import PairPrediction, ScanPair
 from torchcrf_scan.whole_file import write_whole
 
@@ -106,4 +107,4 @@ def _draw(traced: Traced, numbers: Sequence[int], folder: Path) -> None:
 
     for rank, b in enumerate(numbers, 1):
         pair = traced.pairs[b]
-        save_figure(plot_pair(pair, traced.answers[b]), str(folder / f"{rank:02d}_{pair.name}.png"))
+        save_figure(plot_pair(pair, traced.answers[b]), str(folder / f"{rank:02d}_{file_name(pair.name)}.png"))

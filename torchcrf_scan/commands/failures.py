@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from torchcrf_scan.safe_names import one_line
+
 Result = TypeVar("Result")
 
 
@@ -33,8 +35,3 @@ class LeftOut:
     def __str__(self) -> str:
         """The end of a line."""
         return f"; {self.count} scans or messages left out, the first because of {self.first}" if self.count else ""
-
-
-def one_line(error: Exception) -> str:
-    """The message of an error without line breaks."""
-    return " ".join(str(error).split())

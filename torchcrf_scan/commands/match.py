@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from torchcrf_scan.commands.arguments import batches, find_pairs, load_model, make_folder
-from torchcrf_scan.commands.failures import LeftOut, attempt, one_line
+from torchcrf_scan.commands.failures import LeftOut, attempt
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
 from torchcrf_scan.errors import TorchCRFScanError
@@ -19,6 +19,7 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.geometry.velocity import ground_velocity
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
+from torchcrf_scan.safe_names import one_line
 from torchcrf_scan.scan import BACKGROUND, PairPrediction, ScanPair
 
 

@@ -8,11 +8,11 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import TracebackType
 
-from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.data.track_file import writing_tracks
 from torchcrf_scan.data.trajectory_file import writing_trajectory
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.result import ScanResult
+from torchcrf_scan.safe_names import one_line
 
 Add = Callable[[ScanResult], None]
 Output = AbstractContextManager[Add]

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from torchcrf_scan.commands.arguments import load_model
-from torchcrf_scan.commands.failures import LeftOut, one_line
+from torchcrf_scan.commands.failures import LeftOut
 from torchcrf_scan.commands.outputs import Add, Output, Outputs, viewers
 from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
 from torchcrf_scan.data.formats import read_scans
@@ -24,6 +24,7 @@ from torchcrf_scan.data.recording import log_name
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.result import ScanResult
+from torchcrf_scan.safe_names import one_line
 from torchcrf_scan.scan import Floats, Scan
 from torchcrf_scan.stream.clock import Clock
 from torchcrf_scan.stream.stream import ScanStream

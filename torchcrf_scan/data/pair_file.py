@@ -23,6 +23,7 @@ from torchcrf_scan.data.archive import read_arrays
 from torchcrf_scan.data.options import AS_RECORDED, ReadOptions
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.errors import TorchCRFScanError
+from torchcrf_scan.safe_names import check_name
 from torchcrf_scan.scan import OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, Scan, ScanPair, check_sensor
 from torchcrf_scan.whole_file import whole_file
 
@@ -163,6 +164,8 @@ def _parse_pair(fields: _Fields) -> ScanPair:
     source, target = (_parse_scan(fields, side, sensor) for side in ("source", "target"))
     dt = fields.number("dt")
     sequence, origin = (str(fields.get(key, "str")) if key in fields else "" for key in _TEXT_KEYS)
+    for key, text in (("file name", fields.path.stem), ("sequence", sequence), ("source", origin)):
+        check_name(f"{fields.path}: {key}", text)
     annotation = _parse_annotation(fields, source, target)
     try:
         return ScanPair(source, target, dt, annotation, sequence, fields.path.stem, origin)

@@ -14,6 +14,7 @@ from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.stamps import steps_with_a_word
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
+from torchcrf_scan.safe_names import check_name
 from torchcrf_scan.scan import Floats, ScanPair
 
 logger = logging.getLogger(__name__)
@@ -37,11 +38,12 @@ class Recording(Sequence[ScanPair]):
         fault: what ended the reading before the end of the file; None: nothing.
 
     Raises:
-        ValueError: fewer than two scans.
+        ValueError: fewer than two scans, or a name with control characters.
     """
 
     def __init__(self, path: str | Path, read: Read, again: Read | None = None) -> None:
         self.path, self._again = Path(path), again or read
+        check_name(f"{self.path}: file name", self.path.name)
         self.fault: ValueError | None = None
         stamps, odometry = self._survey(read())
         self._steps = steps_with_a_word(stamps, str(self.path))

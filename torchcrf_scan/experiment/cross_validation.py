@@ -5,12 +5,11 @@ A finished fold is a folder `PROTOCOL/FOLD/` with `METHOD/PAIR.npz` predictions 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import pickle
-import re
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -28,11 +27,11 @@ from torchcrf_scan.experiment.methods import METHODS, Answer, answer
 from torchcrf_scan.experiment.models import fit_models
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
+from torchcrf_scan.safe_names import file_name, printable, slug
 from torchcrf_scan.scan import PairPrediction, ScanPair
 from torchcrf_scan.whole_file import whole_path
 
 SECONDS = "seconds.json"
-LONGEST = 100  # bytes of a file name; longer ones are truncated and end in a digest
 PATIENCE = timedelta(days=7)  # waiting time for the folds of other machines
 
 
@@ -62,11 +61,9 @@ def make_folds(protocol: str, pairs: Sequence[ScanPair], tested: int, every: int
         groups.setdefault(pair.name if by_pair else pair.sequence, []).append(k)
     if len(groups) < 2:
         raise TorchCRFScanError(f"{protocol}: expected at least 2 to leave out in turn, got {len(groups)}: {list(groups)}")
-    for names in ([pair.name for pair in pairs[:tested]], list(groups)):
-        paths = [file_name(name) for name in names]
-        twins = [name for name, path in zip(names, paths, strict=True) if paths.count(path) > 1]
-        if twins:
-            raise TorchCRFScanError(f"{protocol}: expected names that differ as file names, got {', '.join(twins[:5])}")
+    counts = Counter(pair.name for pair in pairs[:tested])
+    if twins := [name for name, count in counts.items() if count > 1]:
+        raise TorchCRFScanError(f"{protocol}: expected pair names that differ, got twice {', '.join(map(printable, twins[:5]))}")
     folds = []
     for name, members in groups.items():
         left_out = set(members)
@@ -75,14 +72,6 @@ def make_folds(protocol: str, pairs: Sequence[ScanPair], tested: int, every: int
         if test:
             folds.append(Fold(file_name(name), train, test))
     return folds
-
-
-def file_name(name: str) -> str:
-    """A name as a path component: never one that leads elsewhere (`..`), nor too long for a file."""
-    whole = name.encode(errors="surrogatepass")
-    short = name if len(whole) <= LONGEST else f"{name[: LONGEST // 4]}_{hashlib.sha256(whole).hexdigest()[:12]}"
-    safe = re.sub(r"[^\w.+-]+", "_", short).strip("_")
-    return safe if safe.strip(".") else "unnamed"
 
 
 def run_folds(
@@ -136,7 +125,7 @@ def write_fold(folder: Path, answers: Mapping[str, Mapping[str, Answer]]) -> Non
         temporary.mkdir()
         for pair, by_method in answers.items():
             for method, one in by_method.items():
-                path = temporary / file_name(method) / f"{file_name(pair)}.npz"
+                path = temporary / slug(method) / f"{file_name(pair)}.npz"
                 path.parent.mkdir(exist_ok=True)
                 write_prediction(path, one.prediction)
         (temporary / SECONDS).write_text(json.dumps(seconds, indent=1) + "\n")
@@ -158,7 +147,7 @@ def read_folds(folder: Path, pairs: Sequence[ScanPair], folds: Sequence[Fold]) -
     of_pair = [seconds[fold.name][pairs[k].name] for k, fold in tested]
     methods = [method for method in METHODS if all(method in of for of in of_pair)]
     predictions = {
-        method: [read_prediction(folder / fold.name / file_name(method) / f"{file_name(pairs[k].name)}.npz") for k, fold in tested]
+        method: [read_prediction(folder / fold.name / slug(method) / f"{file_name(pairs[k].name)}.npz") for k, fold in tested]
         for method in methods
     }
     return Results(tuple(pairs[k] for k, _ in tested), predictions, {method: [of[method] for of in of_pair] for method in methods})

@@ -22,12 +22,13 @@ from torchcrf_scan.evaluation.metrics import PairScore, score_pairs
 from torchcrf_scan.evaluation.report import Scores, differences_table, report, sequences_table
 from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.experiment.ablation import ablation_table
-from torchcrf_scan.experiment.cross_validation import Results, cores, file_name, make_folds, rank_and_world, read_folds, run_folds
+from torchcrf_scan.experiment.cross_validation import Results, cores, make_folds, rank_and_world, read_folds, run_folds
 from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning.leaks import TrainedOn
 from torchcrf_scan.learning.run_log import RunLog, one_error
+from torchcrf_scan.safe_names import file_name, slug
 from torchcrf_scan.scan import Ints, PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_associations, save_figure
 from torchcrf_scan.viz.sequences import consecutive, plot_association_sequence, plot_cluster_sequence
@@ -257,7 +258,7 @@ def draw(results: Results, scores: Scores, pairs: Sequence[ScanPair], folder: Pa
             }
             for kind, figure in figures.items():
                 save_figure(figure, folder / f"{kind}_{file_name(pair.name)}.png")
-                run.figure(f"{folder.name}/{kind}/{pair.name}", figure)
+                run.figure(f"{folder.name}/{kind}/{file_name(pair.name)}", figure)
     if RIVAL in results.predictions:
         for k in worst_pairs(scores):
             both = {method: results.predictions[method][k] for method in (RIVAL, JOINT)}
@@ -277,4 +278,4 @@ def write_tables(folder: Path, name: str, tables: Sequence[Table]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / f"{name}.md", "\n\n".join(table.to_markdown() for table in tables) + "\n")
     for table in tables:
-        write_whole(folder / f"{name}_{file_name(table.title.split(' (')[0].split(':')[0])}.csv".lower(), table.to_csv())
+        write_whole(folder / f"{name}_{slug(table.title.split(' (')[0].split(':')[0])}.csv".lower(), table.to_csv())

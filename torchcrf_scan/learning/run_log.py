@@ -15,6 +15,7 @@ from torch.utils.tensorboard.summary import hparams
 
 from torchcrf_scan.evaluation.table import Table
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
+from torchcrf_scan.safe_names import file_name
 from torchcrf_scan.scan import PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_pair, save_figure
 
@@ -108,8 +109,8 @@ class RunLog:
         """The pair with its prediction and the truth side by side: an event, a tag a pair, and with a name a PNG."""
         figure = plot_pair(pair, prediction)
         if name:
-            save_figure(figure, self.folder / "pictures" / f"{name}.png")
-        self.figure(f"pair/{pair.name}", figure, step)
+            save_figure(figure, self.folder / "pictures" / f"{file_name(name)}.png")
+        self.figure(f"pair/{file_name(pair.name)}", figure, step)
 
     def figure(self, tag: str, figure: Figure, step: int = 0) -> None:
         """A figure as an event, without a PNG; it is not closed."""
