@@ -12,6 +12,7 @@ import os
 import re
 import resource
 import shutil
+import signal
 import sys
 import time
 import zipfile
@@ -37,7 +38,7 @@ from torchcrf_scan.data.trajectory_file import read_trajectory
 from torchcrf_scan.experiment.parser import config_of, settings_parser
 from torchcrf_scan.pretrained import CONFIG, WEIGHTS, find_weights
 
-SECONDS, MEMORY = 20, 1 << 30  # limits of one file
+SECONDS, MEMORY = 20, 1 << 30  # of processor time and bytes, limits of one file
 READINGS = 4  # of a log that are matched
 WORDS = ("nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", "1e-320", "99999999999999999999", "", "x", "null", "[]", "3.7", "true")
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:e-?\d+)?")
@@ -268,12 +269,13 @@ def run(recordings: Path, folder: Path, seed: int, seconds: float) -> Counter[st
     torch.set_num_threads(1)
     targets, random, counts = recorded_targets(recordings, Path(__file__).parents[1] / "configs"), Random(seed), Counter[str]()
     limit_memory()
+    faulthandler.register(signal.SIGPROF, chain=True)  # of what takes too long: where it is, and the end
     end = time.process_time() + seconds
     while time.process_time() < end:
         target = random.choice(targets)
-        faulthandler.dump_traceback_later(SECONDS, exit=True)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         counts[f"{Path(target.name).suffix} {target.attempt(folder, random)}"] += 1
-        faulthandler.cancel_dump_traceback_later()
+        signal.setitimer(signal.ITIMER_PROF, 0)
     return counts
 
 

@@ -144,7 +144,7 @@ def test_it_is_part_of_the_program_for_other_runtimes(batch: ScanPairBatch) -> N
 
 
 def test_what_cannot_be() -> None:
-    with pytest.raises(ValueError, match=r"encoder\.width: expected a whole number in \[0, 4096\], got -1"):
+    with pytest.raises(ValueError, match=r"encoder\.width: expected a whole number in \[0, 1024\], got -1"):
         EncoderConfig(width=-1)
     with pytest.raises(ValueError, match=r"features\.embedding: expected dot or cosine for an encoder"):
         ModelConfig(encoder=EncoderConfig(width=4, embedding=2))
