@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from torchcrf_scan.errors import TorchCRFScanError
+
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[BinaryIO]:
@@ -87,3 +89,14 @@ def write_whole(path: Path, content: bytes | str) -> None:
     """
     with whole_file(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
+
+
+def make_folder(option: str, folder: str | Path) -> Path:
+    """Creates a folder if necessary; raises ValueError, with the name of its option, for one that cannot be."""
+    if not str(folder):
+        raise TorchCRFScanError(f"{option}: expected a folder, got an empty name")
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise TorchCRFScanError(f"{option}: expected a folder, got {folder}, where a file is in the way") from error
+    return Path(folder)

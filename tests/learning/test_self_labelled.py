@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from rooms_cast import ROOM, box, ranges_at
 
 from torchcrf_scan import JointScanCRF
 from torchcrf_scan.baselines.cloud import Cloud
@@ -26,28 +27,12 @@ from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, S
 from torchcrf_scan.stream.placement import grid_at
 
 BEAMS = np.radians(np.arange(-135, 135, 1.5))
-ROOM = np.array(
-    [[-4.0, -3.0, 6.0, -3.0], [6.0, -3.0, 6.0, 4.0], [6.0, 4.0, -4.0, 4.0], [-4.0, 4.0, -4.0, -3.0], [2.0, 2.0, 3.0, 2.5]]
-)
 SCANS, STEP, SPEED = 24, 0.1, 1.2  # seconds between scans; m/s of the box
-
-
-def ranges_at(pose: Floats, segments: Floats) -> Floats:
-    """(B,) distance of the first segment (S, 4) along every beam, inf where there is none."""
-    ends = se2.apply(se2.inverse(pose), segments.reshape(-1, 2)).reshape(-1, 4)
-    a, edge = ends[:, :2], ends[:, 2:] - ends[:, :2]
-    dx, dy = np.cos(BEAMS)[:, None], np.sin(BEAMS)[:, None]
-    with np.errstate(all="ignore"):
-        inverse = 1 / (dx * edge[:, 1] - dy * edge[:, 0])
-        far, along = (a[:, 0] * edge[:, 1] - a[:, 1] * edge[:, 0]) * inverse, (a[:, 0] * dy - a[:, 1] * dx) * inverse
-        return np.where((far > 0) & (along >= 0) & (along <= 1), far, np.inf).min(1)
 
 
 def box_at(time: float, lasts: float = np.inf) -> Floats:
     """(4, 4) segments of a square that goes along y, until it is taken away."""
-    x, y, half = 3.0, -2.0 + SPEED * time, 0.35
-    corners = np.array([[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]])
-    return np.concatenate([corners, np.roll(corners, -1, axis=0)], axis=1)[: 4 if time < lasts else 0]
+    return box(3.0, -2.0 + SPEED * time, 0.35)[: 4 if time < lasts else 0]
 
 
 def pose_at(k: int) -> Floats:
@@ -60,7 +45,7 @@ def drive(lasts: float = np.inf, first: float = 0.0) -> list[Reading]:
     for k in range(SCANS):
         time = STEP * k
         segments = np.concatenate([ROOM, box_at(time, lasts)[: 4 if time >= first else 0]])
-        ranges = ranges_at(pose_at(k), segments) + rng.normal(0, 0.005, len(BEAMS))
+        ranges = ranges_at(pose_at(k), segments, BEAMS) + rng.normal(0, 0.005, len(BEAMS))
         readings.append(Reading(Scan.from_ranges(ranges, BEAMS, range_noise=0.005), time))
     return readings
 
@@ -68,7 +53,7 @@ def drive(lasts: float = np.inf, first: float = 0.0) -> list[Reading]:
 def is_box(pair: ScanPair) -> Bools:
     """(n_beams,) what truly moves in the source."""
     k = int(pair.name[-5:]) - 4  # the pair is named by the last of its four scans, 2 apart
-    return ranges_at(pose_at(k), box_at(STEP * k)) < ranges_at(pose_at(k), ROOM)
+    return ranges_at(pose_at(k), box_at(STEP * k), BEAMS) < ranges_at(pose_at(k), ROOM, BEAMS)
 
 
 @cache
@@ -205,8 +190,8 @@ CENTRES = [np.array([3.0, -2.0 + 0.4 * k]) for k in range(4)]
 def seen(k: int, centre: Floats | None) -> Seen:
     """Scan k, with a box whose returns the stream calls object 7."""
     segments = ROOM if centre is None else np.concatenate([ROOM, box_at(0.0)[:4] + np.tile(centre - [3.0, -2.0], 2)])
-    ranges = ranges_at(PATH[k], segments)
-    is_on_box = ranges < ranges_at(PATH[k], ROOM)
+    ranges = ranges_at(PATH[k], segments, BEAMS)
+    is_on_box = ranges < ranges_at(PATH[k], ROOM, BEAMS)
     scan = Scan.from_ranges(ranges, BEAMS, range_noise=0.005)
     track = scan.to_beams(np.where(is_on_box[scan.beam], 7, BACKGROUND), OUTLIER)
     mover = MovingObject(7, CENTRES[k], np.array([0.0, 2.0]), np.eye(4), 0.0, (0.7, 0.7), int(is_on_box.sum()), 1.0)
@@ -259,7 +244,7 @@ def standing(*spurious: int) -> list[Seen]:
     """Four scans from one place, some with a return at 1 m on the first beam."""
     scans = []
     for k in range(4):
-        ranges = ranges_at(PATH[1], ROOM)
+        ranges = ranges_at(PATH[1], ROOM, BEAMS)
         ranges[0] = 1.0 if k in spurious else ranges[0]
         scan = Scan.from_ranges(ranges, BEAMS, range_noise=0.005)
         track = scan.to_beams(np.full(len(scan), BACKGROUND), OUTLIER)

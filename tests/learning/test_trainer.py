@@ -210,6 +210,17 @@ def test_bad_input_is_one_line(arguments: list[str], message: str, tmp_path: Pat
     assert not (tmp_path / "config.yaml").exists()
 
 
+@pytest.mark.parametrize(("output", "got"), [("", "an empty name"), ("file", "file, where a file is in the way")])
+def test_an_output_that_is_no_folder_is_told(
+    output: str, got: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    assert load_main()([*SMALL, f"--output={output}"]) == 1
+    assert capsys.readouterr().err == f"train.py: error: output: expected a folder, got {got}\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -219,7 +230,6 @@ def test_bad_input_is_one_line(arguments: list[str], message: str, tmp_path: Pat
         (["--config=binary.yaml"], "expected a text, got"),
         (["--config=cut.yaml"], "Problems parsing config: while parsing a flow sequence"),
         (["--config=none.yaml"], "File does not exist"),
-        (["--output="], "output: expected a folder, got an empty name"),
     ],
 )
 def test_bad_settings_are_bad_usage_in_one_line(

@@ -4,9 +4,9 @@ import logging
 
 import numpy as np
 import pytest
-from drives import BEAMS, ROOM, ranges_at
 from hypothesis import given
 from hypothesis import strategies as st
+from rooms_cast import BEAMS, ROOM, ranges_at
 from support import assert_close
 
 from torchcrf_scan import JointScanCRF, Scan, ScanStream, StreamConfig

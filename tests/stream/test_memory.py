@@ -1,7 +1,7 @@
 """What earlier scans saw where points lie now."""
 
 import numpy as np
-from drives import ROOM, box, scan_at
+from rooms_cast import ROOM, box, scan_at
 
 from torchcrf_scan.stream.memory import Memory
 from torchcrf_scan.stream.view import History, View

@@ -1,7 +1,7 @@
 """Moving clusters, checked by memory and completed by what was expected."""
 
 import numpy as np
-from drives import box, scan_at
+from rooms_cast import box, scan_at
 
 from torchcrf_scan import PairPrediction
 from torchcrf_scan.geometry import se2

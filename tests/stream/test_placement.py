@@ -1,9 +1,9 @@
 """A scan's background placed on another scan, and the choice of the motion to believe."""
 
 import numpy as np
-from drives import CORRIDOR, ROOM, scan_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rooms_cast import CORRIDOR, ROOM, scan_at
 
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats

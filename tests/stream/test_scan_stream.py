@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drives import BEAMS, CORRIDOR, ROOM, box, path_of, scan_at
+from rooms_cast import BEAMS, CORRIDOR, ROOM, box, path_of, scan_at
 
 from torchcrf_scan import JointScanCRF, Scan, ScanResult, ScanStream, StreamConfig
 from torchcrf_scan.geometry import se2

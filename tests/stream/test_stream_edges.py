@@ -4,9 +4,9 @@ import pickle
 
 import numpy as np
 import pytest
-from drives import BEAMS, ROOM, box, ranges_at, scan_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rooms_cast import BEAMS, ROOM, box, ranges_at, scan_at
 
 from torchcrf_scan import JointScanCRF, Scan, ScanResult, ScanStream
 

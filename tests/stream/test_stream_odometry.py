@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drives import path_of, scan_at
+from rooms_cast import path_of, scan_at
 
 from torchcrf_scan import JointScanCRF, ScanStream
 

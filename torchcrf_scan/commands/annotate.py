@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from torchcrf_scan.annotate.store import Store
-from torchcrf_scan.commands.arguments import PairPlace, find_pairs, load_model, make_folder
+from torchcrf_scan.commands.arguments import PairPlace, find_pairs, load_model
 from torchcrf_scan.commands.failures import LeftOut, attempt
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
+from torchcrf_scan.whole_file import make_folder
 
 if TYPE_CHECKING:
     from torchcrf_scan.annotate.desk import Case

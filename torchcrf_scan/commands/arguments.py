@@ -130,15 +130,6 @@ def listed(values: tuple[str, ...] | str) -> tuple[str, ...]:
     return (values,) if isinstance(values, str) else values
 
 
-def make_folder(option: str, folder: str | Path) -> Path:
-    """Creates the folder if necessary; raises ValueError, with the name of its option, if that fails."""
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise TorchCRFScanError(f"{option}: expected a folder, got {folder}, where a file is in the way") from error
-    return Path(folder)
-
-
 def check_output(output: str, log: str) -> None:
     """Raises ValueError for an output that is a folder, or would replace the log that it is made of."""
     path = Path(output)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchcrf_scan.commands.arguments import listed, make_folder
+from torchcrf_scan.commands.arguments import listed
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED
+from torchcrf_scan.whole_file import make_folder
 
 if TYPE_CHECKING:
     from torchcrf_scan.benchmark.limits import Rates

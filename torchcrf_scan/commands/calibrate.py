@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchcrf_scan.commands.arguments import find_files, load_model, make_folder
+from torchcrf_scan.commands.arguments import find_files, load_model
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED, WEIGHTS
+from torchcrf_scan.whole_file import make_folder
 
 
 def calibrate(pair_files: list[str], output: str, *, model: str = PRETRAINED, threads: int | None = None) -> int:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchcrf_scan.commands.arguments import batches, make_folder
+from torchcrf_scan.commands.arguments import batches
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.safe_names import file_name
 from torchcrf_scan.scan import PairPrediction, ScanPair
-from torchcrf_scan.whole_file import write_whole
+from torchcrf_scan.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     from torchcrf_scan.evaluation.metrics import PairScore

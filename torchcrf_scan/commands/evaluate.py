@@ -14,7 +14,7 @@ from tqdm import tqdm
 from torchcrf_scan.baselines.register import by_command
 from torchcrf_scan.baselines.start import match_start, match_static
 from torchcrf_scan.commands import frames
-from torchcrf_scan.commands.arguments import batches, find_files, load_model, make_folder
+from torchcrf_scan.commands.arguments import batches, find_files, load_model
 from torchcrf_scan.commands.causes import check as check_causes
 from torchcrf_scan.commands.causes import explain
 from torchcrf_scan.commands.frames import FrameOffset, Turn, match_displaced
@@ -26,7 +26,7 @@ from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.scan import PairPrediction, ScanPair
-from torchcrf_scan.whole_file import write_whole
+from torchcrf_scan.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     from torchcrf_scan.evaluation.metrics import PairScore

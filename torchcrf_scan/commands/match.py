@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from torchcrf_scan.commands.arguments import batches, find_pairs, load_model, make_folder
+from torchcrf_scan.commands.arguments import batches, find_pairs, load_model
 from torchcrf_scan.commands.failures import LeftOut, attempt
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
@@ -21,6 +21,7 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
 from torchcrf_scan.safe_names import one_line
 from torchcrf_scan.scan import BACKGROUND, PairPrediction, ScanPair
+from torchcrf_scan.whole_file import make_folder
 
 
 def match(

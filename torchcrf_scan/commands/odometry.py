@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchcrf_scan.commands.arguments import check_output, make_folder
+from torchcrf_scan.commands.arguments import check_output
 from torchcrf_scan.commands.recording import DEFAULTS, Options, process_one
+from torchcrf_scan.whole_file import make_folder
 
 
 def odometry(log: str, output: str, options: Options = DEFAULTS) -> int:

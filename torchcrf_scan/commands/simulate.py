@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchcrf_scan.commands.arguments import make_folder
 from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.errors import TorchCRFScanError
+from torchcrf_scan.whole_file import make_folder
 
 
 def simulate(

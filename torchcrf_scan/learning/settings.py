@@ -244,8 +244,6 @@ class Config:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if not self.output:
-            raise TorchCRFScanError("output: expected a folder, got an empty name")
         other, staged = self.gradient.objective, self.learning.objective
         if not LOSSES[staged].is_staged and other not in (NO_STEPS, staged):
             raise TorchCRFScanError(f"gradient.objective: expected {staged} with learning.objective {staged}, got {other}")

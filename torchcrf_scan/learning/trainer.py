@@ -46,7 +46,7 @@ from torchcrf_scan.learning.weights_fit import Watch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.prediction import Prediction
 from torchcrf_scan.scan import PairPrediction, ScanPair
-from torchcrf_scan.whole_file import write_whole
+from torchcrf_scan.whole_file import make_folder, write_whole
 
 log = logging.getLogger(__name__)
 
@@ -68,8 +68,7 @@ def train(config: Config, *, resume: bool = False) -> dict[str, list[PairScore]]
 
 def train_together(config: Config, ranks: Ranks, *, resume: bool = False) -> dict[str, list[PairScore]]:
     """This process's share of `train`."""
-    folder, resolved = Path(config.output), yaml.safe_dump(asdict(config), sort_keys=False)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder, resolved = make_folder("output", config.output), yaml.safe_dump(asdict(config), sort_keys=False)
     data = load(config, ranks)
     if config.overfit:
         config = replace(config, gradient=replace(config.gradient, fresh=0.0, augment=AugmentConfig.nothing()))
