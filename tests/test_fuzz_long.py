@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import SHARED
 
 WORKER = Path(__file__).with_name("mutants.py")
 
@@ -18,7 +17,7 @@ def test_recorded_files_with_something_wrong_are_answered_or_refused(real_pairs_
     seconds, seed = os.environ.get("FUZZ_SECONDS", "600"), os.environ.get("FUZZ_SEED", "0")
     folder = tmp_path / "mutants"
     folder.mkdir()
-    command = [sys.executable, WORKER, SHARED / "data", folder, seed, seconds]
+    command = [sys.executable, WORKER, real_pairs_dir.parent, folder, seed, seconds]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False)
     assert done.returncode == 0, f"{sorted(folder.iterdir())}\n{done.stderr[-3000:]}"

@@ -97,7 +97,7 @@ def test_a_bad_scan_stops_nothing(caplog: pytest.LogCaptureFixture) -> None:
     assert len(told["odometry"]) == 37
     warnings = [record.message for record in caplog.records]
     assert len(warnings) == 2  # the same fault is told once
-    assert "a scan: ValueError: bearings: expected radians of one turn" in warnings[0]
+    assert "a scan: TorchCRFScanError: bearings: expected radians of one turn" in warnings[0]
     assert "nobody thought of that" in warnings[1]
 
 

@@ -178,7 +178,7 @@ def lessons(model: JointScanCRF, seed: int) -> list[Lesson]:
     view, start = model.view(batch), model.initialise(batch)
     start = start.scaled(view.factor)
     generator = torch.Generator().manual_seed(0)
-    return [Lesson(view, start, training_plugins(view.batch, start, LearningConfig(), generator), 0)]
+    return [Lesson(view, start, training_plugins(view.batch, start, LearningConfig(), generator), 0, torch.ones(3))]
 
 
 @pytest.mark.parametrize("raw_channels", [True, False])

@@ -202,10 +202,10 @@ def background_pool(source: ScanGrid, target: ScanGrid, guess: Array, extra: Arr
 
 def thinned(grid: ScanGrid) -> ScanGrid:
     """The grid of every second, third, ... point of a scan of more than `SEARCHED`: the search costs N^2."""
-    scan, stride = grid.scan, stride_of(len(grid.features), SEARCHED)
+    scan, stride = grid.scan, -(-len(grid.features) // SEARCHED)
     if stride == 1:
         return grid
-    return grid_of(surface_of(every(scan.points, stride), scan.noise, scan.is_closed, scan.origin))
+    return grid_of(surface_of(scan.points[::stride].copy(), scan.noise, scan.is_closed, scan.origin))
 
 
 def find_background(source: ScanGrid, target: ScanGrid, guess: Array, share: Share = alone) -> Array:

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchcrf_scan.inference.motion import LARGEST_TURN, SHIFT_DAMPING, TURN_DAMPING
+from torchcrf_scan.inference.motion import LARGEST_TURN, LEAST_DAMPING, SHIFT_DAMPING, TURN_DAMPING
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.rigid import apply_to_rows, compose_into, inverse, motion_onto, rotate, transform_of
 from torchcrf_scan.loops.solve import solve
 from torchcrf_scan.search.grid import HALF_SPACING, TANGENT_X, TANGENT_Y, UNIT, ScanGrid, X, Y, locate
 
-LEAST_DAMPING = 1e-12  # square metres, of a rotation about a single point; scenes of millimetres must be as those of metres
 PAIR_ROWS = 7  # of points and their partners: moved x and y, partner's x and y, tangent's x and y, weight
 
 # One step.
