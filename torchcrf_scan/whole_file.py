@@ -1,4 +1,4 @@
-"""Atomic writing of files: to a temporary file in the same folder, flushed to the disk, then renamed.
+"""Files that are written whole: to a temporary file in the same folder, flushed to the disk, then renamed. Folders and locks for them.
 
 The temporary file has a name that nobody can guess, and is new: no link is followed.
 """
@@ -100,3 +100,20 @@ def make_folder(option: str, folder: str | Path) -> Path:
     except (FileExistsError, NotADirectoryError) as error:
         raise TorchCRFScanError(f"{option}: expected a folder, got {folder}, where a file is in the way") from error
     return Path(folder)
+
+
+@contextmanager
+def alone(lock: Path, *, wait: bool) -> Iterator[bool]:
+    """Holds a lock while the block runs, or until this process ends; False: another one has it and is not waited for."""
+    try:
+        import fcntl
+    except ImportError:  # Windows has no such locks
+        yield True
+        return
+    with lock.open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            yield False
+            return
+        yield True

@@ -9,7 +9,6 @@ NAME.npz                            finished annotations: all that `FOLDER/*` an
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import os
@@ -23,7 +22,7 @@ from torchcrf_scan.data.pair_file import read_pair, write_pair
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.safe_names import file_name
 from torchcrf_scan.scan import ScanPair
-from torchcrf_scan.whole_file import move_whole, whole_file, write_whole
+from torchcrf_scan.whole_file import alone, move_whole, whole_file, write_whole
 
 logger = logging.getLogger(__name__)
 
@@ -66,13 +65,9 @@ class Store:
             ValueError: another process works here.
         """
         self._aside.mkdir(exist_ok=True)
-        with (self._aside / "lock").open("a") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise TorchCRFScanError(
-                    f"{self.folder}: expected nobody at work here, got another `torchcrf-scan annotate`"
-                ) from error
+        with alone(self._aside / "lock", wait=False) as is_alone:
+            if not is_alone:
+                raise TorchCRFScanError(f"{self.folder}: expected nobody at work here, got another `torchcrf-scan annotate`")
             yield
 
     def read(self, name: str) -> ScanPair | None:

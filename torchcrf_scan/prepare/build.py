@@ -10,7 +10,6 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +19,7 @@ from torchcrf_scan.loops.background import PROGRESS_FILE, lacks_compiler
 from torchcrf_scan.loops.layout import Layout
 from torchcrf_scan.prepare import extension
 from torchcrf_scan.prepare.record import record_layouts
-from torchcrf_scan.whole_file import whole_path, write_whole
+from torchcrf_scan.whole_file import alone, whole_path, write_whole
 
 LOCK_FILE = "lock"
 Progress = Callable[[int, int], None]
@@ -45,7 +44,7 @@ def build_missing(levels: Sequence[str], progress: Progress, *, wait: bool = Tru
         OSError: nowhere to write, or no C compiler.
     """
     folder = machine.writable_folder()
-    with _alone(folder, wait) as is_alone:
+    with alone(folder / LOCK_FILE, wait=wait) as is_alone:
         missing = {level: parts for level in levels if (parts := machine.missing(level))} if is_alone else {}
         if missing and lacks_compiler():
             raise NoCompilerError("expected a C compiler (gcc or clang) to build machine code with, got none; slow loops go on")
@@ -95,23 +94,6 @@ def _remove_older(path: Path, part: str, level: str) -> None:
         for old in path.parent.glob(f"{part}-*-{level}{suffix}*"):
             if not old.name.startswith(machine.stem(part, level)):
                 old.unlink(missing_ok=True)
-
-
-@contextmanager
-def _alone(folder: Path, wait: bool) -> Iterator[bool]:
-    """Holds the folder's lock, which ends with this process; False: another one has it and is not waited for."""
-    try:
-        import fcntl
-    except ImportError:  # Windows has no such lock: the worst is that two processes build the same
-        yield True
-        return
-    with (folder / LOCK_FILE).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            yield False
-            return
-        yield True
 
 
 def write_progress(done: int, count: int) -> None:
