@@ -1,4 +1,4 @@
-"""Files that are written whole: to a temporary file in the same folder, flushed to the disk, then renamed. Folders and locks for them.
+"""Files written whole: to a temporary file in the same folder, flushed to the disk, then renamed; folders and locks for them.
 
 The temporary file has a name that nobody can guess, and is new: no link is followed.
 """
