@@ -285,7 +285,7 @@ def test_two_windows_show_the_same_and_lose_nothing(browser: Any, serve: Serve, 
     second.press("\ue007")
     until((tmp_path / f"{name}.npz").exists)
     browser.switch_to.window(handles[0])
-    until(lambda: first.shown() != name)
+    assert until(lambda: first.shown() != name)
 
 
 def test_a_full_disk_is_told_on_the_page(browser: Any, serve: Serve, tmp_path: Path) -> None:
