@@ -10,11 +10,11 @@ import numpy as np
 from torchcrf_scan.baselines.cloud import Cloud, fit_motion
 from torchcrf_scan.baselines.trimmed_icp import slide
 from torchcrf_scan.batch import range_noise_of
+from torchcrf_scan.data.annotate import scan_gate
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import OUTLIER, Floats, Ints, ScanPair
 
 FOLLOWS = -2  # no target point given by hand: the nearest one within the gate counts
-GATE = 3.2  # times half the scan's usual spacing plus twice its noise, as in the simulator's annotation
 WIDE = (8.0, 8.0, 4.0, 4.0, 2.0, 2.0)  # gates of a search for a motion, one a round; then 1 until nothing changes
 STARTS = 4  # at most, of a search
 ROUNDS = 40  # at most
@@ -40,8 +40,8 @@ class Scans:
     def of(cls, pair: ScanPair, gate: float | None = None) -> Scans:
         """gate: metres; None: by the target's spacing and noise."""
         target = Cloud.of(pair.target) if len(pair.target) else None
-        spacing = 0.0 if target is None else float(np.median(target.spacing))
-        return cls(pair, pair.source.points, target, gate or GATE * (spacing / 2 + 2 * range_noise_of(pair)))
+        spacing = np.zeros(1) if target is None else target.spacing
+        return cls(pair, pair.source.points, target, gate or scan_gate(spacing, range_noise_of(pair)))
 
     def nearest(self, moved: Floats, within: float = 1.0) -> Ints:
         """(P,) the nearest target point within so many gates, or -1. moved: (P, 2), NaN for a motion that is unknown."""

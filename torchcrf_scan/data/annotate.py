@@ -47,6 +47,11 @@ class Capture:
 def association_gate(spacing: Floats, config: SimulatorConfig) -> float:
     """Maximum distance of a moved return to its counterpart, metres; spacing: (M,) of the target scan, not empty."""
     noise = float(np.hypot(config.range_noise, config.vibration))
+    return scan_gate(spacing, noise)
+
+
+def scan_gate(spacing: Floats, noise: float) -> float:
+    """Metres up to which a moved return has a counterpart in a scan, as annotations have it; spacing: (M,), not empty."""
     return GATE * (float(np.median(spacing)) / 2 + 2 * noise)
 
 

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from torchcrf_scan.baselines.cloud import Cloud
 from torchcrf_scan.batch import range_noise_of
+from torchcrf_scan.data.annotate import scan_gate
 from torchcrf_scan.data.formats import read_scans
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.recording import log_name
@@ -34,7 +35,6 @@ STANDS = 2  # of the three others must see a surface where a return stands
 FEWEST = 3  # returns of a mover in the source and in the target
 LEAST_EXPLAINED = 0.5  # share of a mover's returns that lie on its returns in another scan
 LEAST_KNOWN = 0.5  # share of a pair's returns that are labelled
-GATE = 3.2  # times half the target's usual spacing plus twice the noise, as in annotations of recordings
 EARLY = 0.25  # share of the time between the scans of a pair by which it may be shorter
 
 
@@ -120,7 +120,7 @@ def label(seen: Sequence[Seen], sequence: str, name: str) -> ScanPair | None:
     before, source, target, after = seen
     dt = target.time - source.time
     pair = ScanPair(source.result.scan, target.result.scan, dt, None, sequence, name)
-    gate = GATE * (np.median(Cloud.of(target.result.scan).spacing) / 2 + 2 * range_noise_of(pair))
+    gate = scan_gate(Cloud.of(target.result.scan).spacing, range_noise_of(pair))
     motions = [_background_motion(source, target)]
     votes = np.sum([explained_by(source.motion_to(other), source.grid, other.grid) for other in (before, target, after)], axis=0)
     body = np.where((source.track == BACKGROUND) & (votes >= STANDS), BACKGROUND, OUTLIER)
