@@ -102,3 +102,24 @@ def test_an_object_keeps_its_number_and_velocity() -> None:
     np.testing.assert_allclose(last.velocity, [0.0, 1.0], atol=0.15)
     np.testing.assert_allclose(last.position, [2.0, -0.1], atol=0.2)
     assert (results[-1].track == last.number).sum() == last.points > 5
+
+
+@pytest.mark.parametrize("step", [0.1, 0.125])
+def test_a_stream_that_starts_anew_answers_like_a_new_one(step: float) -> None:
+    """Of what it has seen before a gap and another place nothing is left but the pose and the numbers of objects."""
+    poses = [np.array([0.05, 0.03, 0.0]) * min(k, 10) for k in range(24)]  # it turns, drives and stands
+    scans = [scan_at(pose, np.concatenate([ROOM, box(2.0, -2.0 + 0.1 * k)]), k) for k, pose in enumerate(poses)]
+    elsewhere = Scan.from_ranges(0.3 + 0.01 * np.sin(np.arange(len(BEAMS))), BEAMS)
+    stream = ScanStream(model)
+
+    def play(stream: ScanStream, since: float) -> list[ScanResult]:
+        return [stream.feed(scan, since + step * k) for k, scan in enumerate(scans)]
+
+    play(stream, 0.0)
+    stream.feed(elsewhere, 100.0)
+    again, new = play(stream, 200.0), play(ScanStream(model), 0.0)
+    assert any(result.objects for result in new)
+    for a, b in zip(again[1:], new[1:], strict=True):
+        assert (a.moving == b.moving).all()
+        assert (a.status, len(a.objects)) == (b.status, len(b.objects))
+        np.testing.assert_allclose(a.twist, b.twist, atol=1e-9)

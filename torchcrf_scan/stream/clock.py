@@ -9,6 +9,7 @@ from collections import deque
 USUAL = 0.1  # seconds between scans, before any is known
 SHORTEST = 1e-4  # seconds; no scanner is faster, and velocities over less are rounding
 LONGEST = 1e6  # seconds; a stamp that much later is none
+TICKS = 1 << 20  # in a second: what is decided after half a second must not depend on how sums of 0.1 s round
 REMEMBERED = 15  # intervals of which the median is the usual one
 
 log = logging.getLogger(__name__)
@@ -21,7 +22,7 @@ class Clock:
         warns: says in the log when a stamp is not later than the one before, once.
 
     Attributes:
-        now: seconds since the first scan.
+        now: seconds since the first scan, a whole number of ticks.
     """
 
     def __init__(self, *, warns: bool = True) -> None:
@@ -44,7 +45,7 @@ class Clock:
         """Seconds since the scan before, above 0; 0 at the first scan. stamp: seconds, of the new scan."""
         since = stamp - self._last
         is_later = SHORTEST <= since < LONGEST  # false for what is not a number
-        interval = since if is_later else self.usual
+        interval = round((since if is_later else self.usual) * TICKS) / TICKS
         if not self._has_started:
             interval = 0.0
         elif is_later:

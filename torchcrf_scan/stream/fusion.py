@@ -47,13 +47,10 @@ class Standing:
         before = [of for since, of in self._poses if 0 <= time - since <= SETTLING]
         if len(before) < FEWEST:
             return pose
-        apart = np.array([*before, pose]) - pose
-        apart[:, 0] = se2.wrap(apart[:, 0])
+        apart = se2.compose(se2.inverse(pose), np.array([*before, pose]))  # in the sensor's frame: the world's is arbitrary
         middle = np.median(apart, axis=0)
-        bound = np.minimum(STANDS * np.sqrt(np.diag(covariance)), MOST)
-        if (np.abs(middle) > bound).any():
-            return pose
-        return np.array([se2.wrap(pose[0] + middle[0]), *(pose + middle)[1:]])
+        bound = np.minimum(STANDS * np.sqrt(np.diag(turned(covariance, -float(pose[0])))), MOST)
+        return pose if (np.abs(middle) > bound).any() else se2.compose(pose, middle)
 
     def add(self, pose: Floats, time: float) -> None:
         """Remembers a measured pose (3,)."""
