@@ -189,7 +189,7 @@ def background_cost(motion: Motion, source: Surface, target: Surface, slack: flo
 
 
 def gauss_newton_step(
-    moved: np.ndarray, partner: np.ndarray, tangent: np.ndarray, weights: np.ndarray, along: float
+    moved: np.ndarray, partner: np.ndarray, tangent: np.ndarray, weights: np.ndarray, along: float, damping: float = 1e-10
 ) -> tuple[float, float, float]:
     """Solves the damped normal equations of sum w r^T (I - (1 - along) t t^T) r; turns about the weighted centre, 0.5 at most."""
     total = max(float(weights.sum()), 1e-9)
@@ -202,7 +202,7 @@ def gauss_newton_step(
         normal += jacobian.T @ metric @ jacobian
         right -= jacobian.T @ metric @ (p - q)
         lever += w * (x * x + y * y)
-    normal += np.diag([1e-4 * lever + 1e-6 * total, 1e-3 * total, 1e-3 * total])
+    normal += np.diag([1e-4 * lever + damping * total, 1e-3 * total, 1e-3 * total])
     theta, dx, dy = np.linalg.solve(normal, right)
     theta = min(max(theta, -0.5), 0.5)
     back = move((theta, 0.0, 0.0), centre)

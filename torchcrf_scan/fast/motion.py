@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcrf_scan.fast.robust import robust_weight
-from torchcrf_scan.inference.motion import ALONG, PATIENCE
+from torchcrf_scan.inference.motion import ALONG, LEAST_DAMPING, PATIENCE
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.kabsch import kabsch, mean_point
 from torchcrf_scan.loops.rigid import apply_to_rows, compose, motion_onto
@@ -143,7 +143,7 @@ def line_step(members: Members, start: Array, scale: float) -> Array:
     for i in range(len(partner)):
         pairs[2, i], pairs[3, i], pairs[4, i], pairs[5, i] = partner[i, 0], partner[i, 1], tangent[i, 0], tangent[i, 1]
         pairs[6, i] = members.weights[i] * robust_weight((pairs[0, i] - pairs[2, i]) ** 2 + (pairs[1, i] - pairs[3, i]) ** 2, scale)
-    return compose(gauss_newton_step(pairs, ALONG), start)
+    return compose(gauss_newton_step(pairs, ALONG, LEAST_DAMPING), start)
 
 
 @kernel

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchcrf_scan.inference.motion import LARGEST_TURN, LEAST_DAMPING, SHIFT_DAMPING, TURN_DAMPING
+from torchcrf_scan.inference.motion import LARGEST_TURN, SHIFT_DAMPING, TURN_DAMPING
 from torchcrf_scan.loops.jit import Array, Integers, kernel
 from torchcrf_scan.loops.rigid import apply_to_rows, compose_into, inverse, motion_onto, rotate, transform_of
 from torchcrf_scan.loops.solve import solve
 from torchcrf_scan.search.grid import HALF_SPACING, TANGENT_X, TANGENT_Y, UNIT, ScanGrid, X, Y, locate
 
+LEAST_DAMPING = 1e-10  # square metres, far below any noise: lengths may be of any size
 PAIR_ROWS = 7  # of points and their partners: moved x and y, partner's x and y, tangent's x and y, weight
 
 # One step.
@@ -34,12 +35,13 @@ def surface_residual(moved: Array, grid: ScanGrid, squared: Array, index: Intege
 
 
 @kernel
-def gauss_newton_step(pairs: Array, along: float) -> Array:
+def gauss_newton_step(pairs: Array, along: float, damping: float) -> Array:
     """(3,) one least-squares step of a rigid motion, applied after the present one; the identity where all weights are 0.
 
     Args:
         pairs: (7, P) moved points, partners, tangents and weights, a coordinate a row.
         along: 1 point-to-point, 0 point-to-line.
+        damping: square length, of a rotation about a single point, which has no lever.
     """
     xs, ys, partner_xs, partner_ys, tangent_xs, tangent_ys, weights = pairs
     total = sum_x = sum_y = 0.0
@@ -68,7 +70,7 @@ def gauss_newton_step(pairs: Array, along: float) -> Array:
         r0 += wrt * (lx * tx + ly * ty) - w * (lx * rx + ly * ry)
         r1 += wrt * tx - w * rx
         r2 += wrt * ty - w * ry
-    n00 += TURN_DAMPING * scale + LEAST_DAMPING * total
+    n00 += TURN_DAMPING * scale + damping * total
     n11, n22 = n11 + SHIFT_DAMPING * total, n22 + SHIFT_DAMPING * total
     theta, x, y = solve(n00, n01, n02, n11, n12, n22, r0, r1, r2)
     step = motion_onto(min(max(theta, -LARGEST_TURN), LARGEST_TURN), pivot_x, pivot_y, pivot_x, pivot_y)
@@ -108,7 +110,7 @@ def register(source: Array, weights: Array, target: ScanGrid, motions: Array, ga
             apply_to_rows(motion, source, pairs)
             locate(pairs, target, squared, index)
             _pair(target, squared, index, weights, gates[i], pairs)
-            compose_into(motion, gauss_newton_step(pairs, along[i]))
+            compose_into(motion, gauss_newton_step(pairs, along[i], LEAST_DAMPING))
     return refined
 
 
@@ -152,5 +154,5 @@ def register_both(source: ScanGrid, target: ScanGrid, motions: Array, gates: Arr
             apply_to_rows(inverse(motion), target.scan.points, returned)
             surface_residual(returned, source, squared[N:], back)
             _pair_both(source, target, motion, squared, onto, back, gates[i], pairs)
-            compose_into(motion, gauss_newton_step(pairs, along[i]))
+            compose_into(motion, gauss_newton_step(pairs, along[i], LEAST_DAMPING))
     return refined
