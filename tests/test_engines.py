@@ -94,3 +94,19 @@ def test_both_engines_agree(scenes: Callable[[np.random.Generator], Iterator[Sca
         size = float(np.median(pair.source.ranges))
         torch.testing.assert_close(found.motions[..., 1:] / size, expected.motions[..., 1:] / size, rtol=1e-6, atol=1e-7)
         torch.testing.assert_close(found.motions[..., 0], expected.motions[..., 0], rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("times", [1e-3, 1e3])  # millimetres and milliseconds that count as metres and seconds, and the other way
+@pytest.mark.parametrize("world", ["street", "indoor"])
+def test_labels_do_not_depend_on_the_units_of_length_and_time(world: str, times: float) -> None:
+    def of_size(scan: Scan, times: float) -> Scan:
+        """Ranges and their noise so many times as large; how far the sensor sees, which has bounds in metres, is not told."""
+        return replace(scan, ranges=scan.ranges * times, range_noise=0.01 * times, range_min=None, range_max=None)
+
+    for pair in simulate_pairs(replace(NAMED_WORLDS[world], beams=121), 6, 3, 9):
+        one, other = (
+            model("compiled").match(of_size(pair.source, factor), of_size(pair.target, factor), pair.dt * factor)
+            for factor in (1.0, times)
+        )
+        np.testing.assert_array_equal(one.association, other.association)
+        np.testing.assert_array_equal(one.cluster, other.cluster)
