@@ -46,6 +46,7 @@ def see_corner(motion: Tensor, beams: int = 181) -> Tensor:
 def corner(motion: Tensor) -> ScanGrid:
     return grid_of(seen(see_corner(motion)))
 
+
 DAMPING = 1e-6
 
 
