@@ -28,6 +28,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from jsonargparse import ArgumentError
+from small_files import POSES, TRACKS, prediction_bytes
 
 from torchcrf_scan import JointScanCRF, PairPrediction, ScanPair, ScanStream, TorchCRFScanError
 from torchcrf_scan.cli import main
@@ -226,18 +227,9 @@ def other_targets(pair: ScanPair, configs: Path) -> Iterator[Target]:
         yield Target(name, (find_weights("encoder") / name).read_bytes(), partial(use_model, name=name, pair=pair))
     for file in sorted(configs.glob("*.yaml")):
         yield Target(file.name, file.read_bytes(), use_settings)
-    poses = b"".join(b"%d.5 0.1 0.2 0 0 0 0.1 0.9\n" % k for k in range(5))
-    yield Target("poses.tum", poses, lambda path: assert_all(read_trajectory(path).poses))
-    tracks = b"stamp,id,x,y,heading,vx,vy,length,width,points\n" + 3 * b"1.5,2,0.1,0.2,0.3,0.4,0.5,4.1,1.7,12\n"
-    yield Target("tracks.csv", tracks, lambda path: assert_all(read_tracks(path).position))
-    out = io.BytesIO()
-    np.savez(out, **{key: value for key, value in prediction_arrays(pair).items() if value is not None})
-    yield Target("prediction.npz", out.getvalue(), lambda path: assert_all(read_prediction(path).cluster), mutated_archive)
-
-
-def prediction_arrays(pair: ScanPair) -> dict[str, np.ndarray]:
-    (answer,) = model().match_pairs([pair])
-    return {name: np.asarray(getattr(answer, name)) for name in PairPrediction.__slots__}
+    yield Target("poses.tum", POSES, lambda path: assert_all(read_trajectory(path).poses))
+    yield Target("tracks.csv", TRACKS, lambda path: assert_all(read_tracks(path).position))
+    yield Target("prediction.npz", prediction_bytes(), lambda path: assert_all(read_prediction(path).cluster), mutated_archive)
 
 
 def assert_all(values: np.ndarray) -> None:

@@ -1,6 +1,5 @@
 """Whatever is given, there is an answer of finite numbers or a `TorchCRFScanError`: a few seconds of it."""
 
-import io
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -10,18 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mutants import Target, assert_finite, log_targets, model, mutated, other_targets, pair_targets, use_log
+from small_files import PAIR, bags, carmen, csv, pair_bytes
 
 from torchcrf_scan import InferenceConfig, Scan, TorchCRFScanError
 from torchcrf_scan.checks import from_values
 from torchcrf_scan.config import ModelConfig
-from torchcrf_scan.data.pair_file import write_pair
-from torchcrf_scan.data.simulate import simulate_pairs
-from torchcrf_scan.data.worlds import SimulatorConfig
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 TRIES = 4  # of every kind of file
-
-(PAIR,) = simulate_pairs(SimulatorConfig(beams=61), 1, 1, 0)
 
 number = st.floats() | st.sampled_from([0.0, -1.0, 1.0, 5.0, 1e6, 1e20, 1e38, 1e39, 1e300, 5e-324])
 ranges = st.lists(st.floats(0.05, 60) | number, max_size=40)
@@ -111,47 +106,15 @@ def test_settings_that_are_taken_give_finite_answers(values: dict[str, Any]) -> 
     assert_finite(changed.match(PAIR.source, PAIR.target))
 
 
-def pair_bytes(folder: Path) -> bytes:
-    write_pair(folder / "made.npz", PAIR)
-    data = (folder / "made.npz").read_bytes()
-    (folder / "made.npz").unlink()
-    return data
-
-
-def carmen(pairs: int = 4) -> bytes:
-    values = " ".join(f"{value:.2f}" for value in PAIR.source.to_beams(PAIR.source.ranges, 81.91))
-    lines = [f"FLASER {PAIR.source.n_beams} {values} 0 0 0 {0.1 * k:.2f} 0 0 {k}.0 host {k}.0" for k in range(pairs)]
-    return ("PARAM laser_front_laser_resolution 1.0\n" + "\n".join(lines) + "\n").encode()
-
-
-def csv() -> bytes:
-    out = io.StringIO()
-    np.savetxt(out, np.column_stack([np.arange(4.0), np.full((4, 20), 2.5)]), delimiter=",", fmt="%.3f")
-    return ("stamp," + ",".join(f"{value:.3f}" for value in np.linspace(-1, 1, 20)) + "\n" + out.getvalue()).encode()
-
-
 def targets(kind: str, folder: Path) -> list[Target]:
     if kind == "pair":
         return list(pair_targets("pair.npz", pair_bytes(folder)))
     if kind == "log":
         return [*log_targets("a.log", carmen()), *log_targets("a.csv", csv())]
     if kind == "bag":
+        pytest.importorskip("rosbags", reason="the library rosbags is not installed (extra `ros`)")
         return [Target(name, data, use_log, mutated) for name, data in bags(folder)]
     return list(other_targets(PAIR, CONFIGS))
-
-
-def bags(folder: Path) -> list[tuple[str, bytes]]:
-    pytest.importorskip("rosbags", reason="the library rosbags is not installed (extra `ros`)")
-    from bags import LASER, laser, room, write
-
-    drive = [("/scan", LASER, 100 + 0.1 * k, laser(100 + 0.1 * k, room(0.1 * k))) for k in range(3)]
-    forms = ("ros1", "ros1 lz4", "sqlite file", "mcap file")
-    made = []
-    for k, form in enumerate(forms):
-        (folder / str(k)).mkdir()
-        path = write(folder / str(k), form, drive)
-        made.append((path.name, path.read_bytes()))
-    return made
 
 
 @pytest.mark.parametrize("kind", ["pair", "log", "bag", "other"])

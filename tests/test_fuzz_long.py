@@ -1,4 +1,4 @@
-"""Mutations of recorded files, for minutes: `pytest -m fuzz`. FUZZ_SECONDS: of processor time; FUZZ_SEED."""
+"""Damaged files, for minutes: `pytest -m fuzz`. FUZZ_SECONDS: of processor time, for recorded files; FUZZ_RUNS: of every reader."""
 
 import json
 import os
@@ -26,3 +26,15 @@ def test_recorded_files_with_something_wrong_are_answered_or_refused(real_pairs_
     assert {outcome.split()[1] for outcome in counts} == {"answered", "refused"}
     assert list(tmp_path.iterdir()) == [folder]
     assert not list(folder.iterdir())
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("kind", ["pair", "prediction", "carmen", "csv", "ros1", "ros2", "mcap", "poses", "tracks", "config"])
+def test_readers_answer_or_refuse_what_reaches_new_lines(kind: str, tmp_path: Path) -> None:
+    pytest.importorskip("atheris", reason="atheris, which finds what reaches new lines, is not installed")
+    runs, seed = os.environ.get("FUZZ_RUNS", "10000"), os.environ.get("FUZZ_SEED", "1")
+    command = [sys.executable, WORKER.with_name("covered.py"), kind, tmp_path / "covered", f"-runs={runs}", f"-seed={seed}"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "TORCHCRF_SCAN_PREPARE": "0", "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False)
+    assert done.returncode == 0, done.stderr[-5000:]
+    assert f"Done {runs} runs" in done.stderr

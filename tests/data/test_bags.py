@@ -14,6 +14,7 @@ pytest.importorskip("rosbags", reason="the library rosbags is not installed (ext
 
 from bags import BEAMS, CLOUD, FORMATS, LASER, ODOMETRY, STORES, TRANSFORMS, cloud, drive, header, laser, made, room, wheels, write
 
+from torchcrf_scan import TorchCRFScanError
 from torchcrf_scan.data import bag_records, mcap_bag, ros1_bag
 from torchcrf_scan.data.formats import read_recording, read_scans
 from torchcrf_scan.data.options import ReadOptions
@@ -289,6 +290,15 @@ def test_chunks_beyond_the_limit_are_not_unpacked(tmp_path: Path, form: str, mod
     monkeypatch.setattr(bag_records, "MOST_CHUNK", 1 << 28)
     monkeypatch.setattr(module, "MOST_CHUNK", 1000)
     assert "at most 1000" in read_until_fault(path)[1]
+
+
+@pytest.mark.parametrize("length", [100, 1 << 40, (1 << 64) - 1])
+def test_a_chunk_that_promises_more_than_there_is_of_mcap(tmp_path: Path, length: int) -> None:
+    chunk = bytes(28) + struct.pack("<IQ", 0, length) + bytes(50)
+    path = tmp_path / "run.mcap"
+    path.write_bytes(mcap_bag.MAGIC + struct.pack("<BQ", mcap_bag.CHUNK, len(chunk)) + chunk)
+    with pytest.raises(TorchCRFScanError, match=r"run\.mcap, byte \d+: expected a whole record of MCAP, got "):
+        list(read_scans(path))
 
 
 @pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])

@@ -59,7 +59,16 @@ def test_another_text_is_told_the_formats(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"#ROSBAG V2", b"\x89MCAP", b"SQLite format", b"P", b"\x1f\x8b\x08\0", gzip.compress(CARMEN.encode(), mtime=0)[:15]],
+    [
+        b"",
+        b"#ROSBAG V2",
+        b"\x89MCAP",
+        b"SQLite format",
+        b"P",
+        b"\x1f\x8b\x07" + bytes(9),
+        b"\x1f\x8b\x08\0",
+        gzip.compress(CARMEN.encode(), mtime=0)[:15],
+    ],
 )
 def test_a_file_that_ends_before_its_format_is_known(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "run.bag"

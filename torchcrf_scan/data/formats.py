@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -98,7 +99,7 @@ def _head(path: Path) -> bytes:
     with open_unpacked(path) as file:
         try:
             return file.read(HEAD)
-        except (EOFError, zlib.error):
+        except (EOFError, gzip.BadGzipFile, zlib.error):
             return b""
 
 

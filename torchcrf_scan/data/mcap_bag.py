@@ -118,10 +118,7 @@ def _read_message(kind: int, data: bytes, found: _Channels, offset: int) -> Iter
 
 def _read_record(file: BinaryIO) -> tuple[int, bytes]:
     head = _exactly(file, 9)
-    size = int(struct.unpack("<Q", head[1:])[0])
-    if size > MOST_CHUNK:
-        raise TorchCRFScanError(f"expected records of at most {MOST_CHUNK} bytes, got {size}")
-    return head[0], _exactly(file, size)
+    return head[0], _exactly(file, int(struct.unpack("<Q", head[1:])[0]))
 
 
 def _unpack(data: bytes) -> bytes:
@@ -140,6 +137,8 @@ def _string(file: BinaryIO) -> str:
 
 
 def _exactly(file: BinaryIO, size: int) -> bytes:
+    if size > MOST_CHUNK:
+        raise TorchCRFScanError(f"expected parts of at most {MOST_CHUNK} bytes, got {size}")
     data = file.read(size)
     if len(data) != size:
         raise EOFError(f"{len(data)} of {size} bytes")
