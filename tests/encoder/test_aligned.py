@@ -47,7 +47,8 @@ def test_compiled_code_sees_the_same(world: str) -> None:
     batch = simulated(world)
     offset = torch.tensor([[0.4, 2.0, -1.0]], dtype=torch.float64).expand(len(batch), 3)
     reach = normal(len(batch), batch.source.shape[1], 3, seed=3).clamp(min=0)
-    for of, start in ((batch, started(batch)), (batch.displaced(offset), started(batch, reach=reach))):
+    unknown = replace(started(batch), reach=None)
+    for of, start in ((batch, started(batch)), (batch.displaced(offset), started(batch, reach=reach)), (batch, unknown)):
         for found, expected in zip(aligned_inputs(of, start, "compiled"), aligned_inputs(of, start, "eager"), strict=True):
             assert_close(found, expected, tolerance=1e-9)
     assert len(aligned_inputs(batch, started(batch), "compiled", both=False)) == 1
