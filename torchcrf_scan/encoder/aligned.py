@@ -85,8 +85,7 @@ def own_channels(side: Side) -> tuple[Tensor, Tensor]:
     sweep = side.sweep
     ranges = torch.where(side.mask, sweep.ranges, 0.0)
     bearings = torch.where(side.mask, sweep.bearings, 0.0)
-    footprint = sweep.noise[:, None] + ranges * sweep.step[:, None]
-    unit = footprint.clamp(min=1e-9)
+    unit = (sweep.noise[:, None] + ranges * sweep.step[:, None]).clamp(min=1e-9)
     place = torch.arange(ranges.shape[1], device=ranges.device).expand_as(side.mask)
     found = []
     for k in BESIDE:

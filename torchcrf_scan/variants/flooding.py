@@ -20,7 +20,6 @@ from torchcrf_scan.features.candidates import Candidates
 from torchcrf_scan.features.potentials import (
     AssociationStates,
     PairView,
-    association_potentials,
     association_unary,
     clustering_potentials,
     clustering_unary,
@@ -248,11 +247,8 @@ class Flooding:
             carried = torch.where(same.any(-1), carried, least)
             setattr(self.association_messages, name, torch.cat([carried, message[..., -1:]], dim=-1))
         self.states = AssociationStates.of(self.view, found.index, found.mask, scales, self.parameters.boosters)
-        pairwise = pairwise_features(batch.source, batch.target, found.index, scales)
-        none = pairwise.new_zeros(*found.index.shape, ASSOCIATION_UNARY)
-        _, self.edges = association_potentials(
-            torch.cat([none, none[:, :, :1]], dim=2), pairwise, found.mask, self.parameters.association
-        )
+        pairwise = pairwise_features(batch.source, batch.target, found.index, scales, has_lengths=self.view.has_lengths)
+        self.edges = pairwise @ self.parameters.association[ASSOCIATION_UNARY:]
         self.state = replace(self.state, candidates=found.index, candidate_mask=found.mask)
 
     def _retire_empty(self) -> None:
