@@ -101,7 +101,7 @@ class Flooding:
 
     def __init__(self, view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> None:
         self.view, self.start, self.parameters, self.model = view, start, parameters, model
-        self.state = joint.first_state(view, start, parameters, model.inference)
+        self.state = joint.first_state(view, start, model.inference)
         B, N = view.batch.source.shape[:2]
         self.cluster_messages = Messages.zeros(B, N, self.state.log_cluster.shape[-1], view.batch.source)
         self.association_messages = Messages.zeros(B, N, self.state.log_association.shape[-1], view.batch.source)
