@@ -2,6 +2,7 @@
 
 from dataclasses import fields, replace
 
+import numpy as np
 import torch
 from support import assert_close, generator, make_points, normal
 from torch import Tensor
@@ -11,9 +12,15 @@ from torchcrf_scan.features.boosting import StumpEnsemble
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start, nearest_association
 from torchcrf_scan.prediction import Prediction
+from torchcrf_scan.scan import Scan
 
 MOTIONS = torch.tensor([[0.05, -0.3, 0.1], [-0.1, 0.9, 0.3], [0.2, -0.2, -1.0]], dtype=torch.float64)
 CASES = ("all outliers", "empty source", "empty target", "one point", "duplicates", "background only")
+
+
+def tiny_scan(points: int) -> Scan:
+    """The first few of nine beams return, from a wall four metres away."""
+    return Scan.from_ranges(np.where(np.arange(9) < points, 4.0, np.inf), np.linspace(-0.5, 0.5, 9))
 
 
 def make_batch(source: Tensor, target: Tensor, lengths: tuple[list[int], list[int]] | None = None) -> ScanPairBatch:

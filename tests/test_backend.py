@@ -6,8 +6,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+from scenes import tiny_scan
 
-from torchcrf_scan import JointScanCRF, Scan, ScanPair, ScanPairBatch
+from torchcrf_scan import JointScanCRF, ScanPair, ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.geometry import se2
@@ -15,11 +16,6 @@ from torchcrf_scan.inference.start import Start
 from torchcrf_scan.prediction import Prediction
 
 SCANNER = SimulatorConfig(beams=121)
-
-
-def tiny_scan(points: int) -> Scan:
-    bearings = np.linspace(-0.5, 0.5, 9)
-    return Scan.from_ranges(np.where(np.arange(9) < points, 4.0, np.inf), bearings)
 
 
 @pytest.fixture(scope="module")

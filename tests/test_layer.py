@@ -237,7 +237,7 @@ def test_the_choice_of_movers_hears_of_moving_points() -> None:
 
     def worth(extra: ExtraLogUnary | None) -> float:
         view = model.view(batch, model.learned_inputs(batch, extra_log_unary=extra))
-        state = first_state(view, start, model.fitted, config)
+        state = first_state(view, start, config)
         return float(evidence(view, start, state, model.fitted, config)[0, 1])
 
     assert worth(logits(moving=2.0)) > worth(None) > worth(logits(moving=-2.0))

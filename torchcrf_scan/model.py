@@ -61,6 +61,9 @@ class JointScanCRF(nn.Module):
     motions with `inference.motion_weights = soft`; at fixed candidates and away from kinks (ties, clipped errors). Labels, start,
     candidates, unit of length, free space and boosted scores (steps unless `features.smooth` is above 0) have none. The schedule
     `flooding` has no gradient and fits its motions by Eq. 6 on hard labels, whatever the metric and the weights.
+
+    Args:
+        config: settings; None: the defaults. The weights are those of `reset_parameters`; `from_pretrained` loads fitted ones.
     """
 
     association_weights: nn.ParameterDict
@@ -443,14 +446,26 @@ class JointScanCRF(nn.Module):
 
 
 class MatchingCRF(JointScanCRF):
-    """The association chain alone, 18 weights, one motion for the whole scan (A-25): CRF-Matching."""
+    """CRF-Matching: the association chain alone, with one motion for the whole scan (A-25).
+
+    It uses the weights of that chain only: 18 of the paper's features and, by default, five of the extensions.
+
+    Args:
+        config: as in `JointScanCRF`, but for `chains` and `coupling`.
+    """
 
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__(replace(config or ModelConfig(), chains="matching", coupling="motions"))
 
 
 class ClusteringCRF(JointScanCRF):
-    """The clustering chain alone, 12 weights, on the fixed associations of the start: CRF-Clustering."""
+    """CRF-Clustering: the clustering chain alone, on the fixed associations of the start.
+
+    It uses the weights of that chain only: 12 of the paper's features and, by default, eight of the extensions.
+
+    Args:
+        config: as in `JointScanCRF`, but for `chains` and `coupling`.
+    """
 
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__(replace(config or ModelConfig(), chains="clustering", coupling="motions"))

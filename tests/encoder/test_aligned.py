@@ -3,12 +3,12 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
+from scenes import tiny_scan
 from support import assert_close, normal
 
-from torchcrf_scan import Scan, ScanPair, ScanPairBatch
+from torchcrf_scan import ScanPair, ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import WORLDS
 from torchcrf_scan.encoder.aligned import aligned_inputs
@@ -38,16 +38,13 @@ def started(batch: ScanPairBatch, *, reach: torch.Tensor | None = None) -> Start
     return Start(MOTIONS.expand(B, 3, 3), active, *nothing, reach, log_odds)
 
 
-def scan_of(points: int) -> Scan:
-    return Scan.from_ranges(np.where(np.arange(9) < points, 4.0, np.inf), np.linspace(-0.5, 0.5, 9))
-
-
 @pytest.mark.parametrize("world", ["street", "model_cars"])
 def test_compiled_code_sees_the_same(world: str) -> None:
     batch = simulated(world)
     offset = torch.tensor([[0.4, 2.0, -1.0]], dtype=torch.float64).expand(len(batch), 3)
     reach = normal(len(batch), batch.source.shape[1], 3, seed=3).clamp(min=0)
-    for of, start in ((batch, started(batch)), (batch.displaced(offset), started(batch, reach=reach))):
+    unknown = replace(started(batch), reach=None)
+    for of, start in ((batch, started(batch)), (batch.displaced(offset), started(batch, reach=reach)), (batch, unknown)):
         for found, expected in zip(aligned_inputs(of, start, "compiled"), aligned_inputs(of, start, "eager"), strict=True):
             assert_close(found, expected, tolerance=1e-9)
     assert len(aligned_inputs(batch, started(batch), "compiled", both=False)) == 1
@@ -55,7 +52,7 @@ def test_compiled_code_sees_the_same(world: str) -> None:
 
 @pytest.mark.parametrize("backend", ["eager", "auto"])
 def test_scans_with_hardly_a_point(backend: str) -> None:
-    pairs = [ScanPair(scan_of(n), scan_of(m)) for n, m in ((0, 0), (0, 5), (1, 0), (1, 1), (2, 9))]
+    pairs = [ScanPair(tiny_scan(n), tiny_scan(m)) for n, m in ((0, 0), (0, 5), (1, 0), (1, 1), (2, 9))]
     batch = ScanPairBatch.collate(pairs, torch.float64)
     for inputs, mask in zip(aligned_inputs(batch, started(batch), backend), (batch.source_mask, batch.target_mask), strict=True):
         assert inputs.shape == (*mask.shape, len(CHANNELS))

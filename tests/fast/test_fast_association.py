@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scenes import make_batch
 from support import make_points, normal
 from torch import Tensor
 
@@ -120,17 +121,9 @@ def test_recorded_scans(name: str) -> None:
 
 
 def small_batch(source: Tensor, target: Tensor, closed: bool = False) -> ScanPairBatch:
-    return ScanPairBatch(
-        source=source[None],
-        target=target[None],
-        source_mask=torch.ones(1, len(source), dtype=torch.bool),
-        target_mask=torch.ones(1, len(target), dtype=torch.bool),
-        source_closed=torch.tensor([closed]),
-        target_closed=torch.tensor([closed]),
-        dt=torch.full((1,), 0.1, dtype=torch.float64),
-        range_noise=torch.full((1,), 0.01, dtype=torch.float64),
-        initial_motion=torch.tensor([[0.1, 0.5, -0.2]], dtype=torch.float64),
-    )
+    is_closed, guess = torch.tensor([closed]), torch.tensor([[0.1, 0.5, -0.2]], dtype=torch.float64)
+    batch = make_batch(source[None], target[None])
+    return replace(batch, source_closed=is_closed, target_closed=is_closed, initial_motion=guess)
 
 
 SPOT = torch.tensor([[1.0, 2.0]], dtype=torch.float64)

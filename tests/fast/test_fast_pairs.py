@@ -3,16 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from scenes import tiny_scan
 
-from torchcrf_scan import JointScanCRF, PairPrediction, Scan, ScanPair, ScanPairBatch
+from torchcrf_scan import JointScanCRF, PairPrediction, ScanPair, ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 
 SINGLE = 1e-5  # of numbers that went through tensors in single precision; covariances and angles of their order
-
-
-def tiny_scan(points: int) -> Scan:
-    return Scan.from_ranges(np.where(np.arange(9) < points, 4.0, np.inf), np.linspace(-0.5, 0.5, 9))
 
 
 @pytest.fixture(scope="module")

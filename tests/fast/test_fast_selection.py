@@ -38,7 +38,7 @@ def considered(seed: int) -> tuple[ScanPairBatch, PairView, Start, State]:
     )  # a point on a beam, as where the sensor stands still, is on the side that rounding takes it to
     start = replace(start, motions=off_beams)
     scaled = start.scaled(view.factor).considered()
-    return batch, view, start, first_state(view, scaled, layer().fitted, layer().config.inference)
+    return batch, view, start, first_state(view, scaled, layer().config.inference)
 
 
 def array(values: Tensor) -> Any:
@@ -54,7 +54,7 @@ def test_evidence_and_choice_agree_with_the_eager_ones(seed: int, odds: float) -
     pair = pair_of(batch, 0)
     begin, none = start_arrays(start, 0, pair), np.zeros(len(pair.source))
     scene = decode.scene_of(pair, begin, none, none, settings)
-    ours = decode.first_state(scene, begin, False, settings)
+    ours = decode.first_state(scene, begin, False)
     tables = rounds.tables_of(scene, ours, learned.clustering)
     scaled = start.scaled(view.factor).considered()
     expected = eager.evidence(view, scaled, state, fitted, config.inference)
@@ -73,7 +73,7 @@ def test_the_background_alone_is_never_asked() -> None:
     pair = pair_of(batch, 0)
     begin, none = start_arrays(start, 0, pair), np.zeros(len(pair.source))
     scene = decode.scene_of(pair, begin, none, none, settings)
-    state = decode.first_state(scene, begin, True, settings)
+    state = decode.first_state(scene, begin, True)
     state.active[1:] = False
     selection.discard_vacuous(
         rounds.tables_of(scene, state, learned.clustering), state.active, begin.log_odds, learned.clustering, learned.worth

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import oracles
 import pytest
+import scenes
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -137,17 +138,7 @@ def test_the_gate_is_half_open_at_the_gate() -> None:
 
 def make_batch(seed: int = 0, n: int = 50, m: int = 40) -> ScanPairBatch:
     """One pair that does not fit, so that there is something in front of beams and behind them."""
-    return ScanPairBatch(
-        source=make_points(n, seed)[None],
-        target=make_points(m, seed + 20)[None],
-        source_mask=torch.ones(1, n, dtype=torch.bool),
-        target_mask=torch.ones(1, m, dtype=torch.bool),
-        source_closed=torch.zeros(1, dtype=torch.bool),
-        target_closed=torch.zeros(1, dtype=torch.bool),
-        dt=torch.full((1,), 0.1).double(),
-        range_noise=torch.full((1,), 0.01).double(),
-        initial_motion=torch.zeros(1, 3).double(),
-    )
+    return scenes.make_batch(make_points(n, seed)[None], make_points(m, seed + 20)[None])
 
 
 def features(

@@ -6,6 +6,7 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from scenes import make_batch
 from support import all_real, assert_close, make_points, normal
 from torch import Tensor
 
@@ -25,18 +26,8 @@ GUESS = torch.tensor([[0.3, 0.5, -0.8]], dtype=torch.float64)
 
 def make_view(guess: Tensor = GUESS) -> PairView:
     """One pair whose last target point is padding."""
-    batch = ScanPairBatch(
-        source=make_points(N, 1)[None],
-        target=make_points(M, 2)[None],
-        source_mask=torch.ones(1, N, dtype=torch.bool),
-        target_mask=torch.arange(M)[None] < M - 1,
-        source_closed=torch.zeros(1, dtype=torch.bool),
-        target_closed=torch.zeros(1, dtype=torch.bool),
-        dt=torch.full((1,), 0.1).double(),
-        range_noise=torch.full((1,), 0.01).double(),
-        initial_motion=guess,
-    )
-    return PairView.of(batch)
+    batch = make_batch(make_points(N, 1)[None], make_points(M, 2)[None], ([N], [M - 1]))
+    return PairView.of(replace(batch, initial_motion=guess))
 
 
 def best(score: np.ndarray, count: int) -> list[list[int]]:

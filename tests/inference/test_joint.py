@@ -296,7 +296,7 @@ def test_early_stop_saves_rounds() -> None:
 
 def test_a_swing_is_halved() -> None:
     batch, _ = scene(6)
-    state = joint.first_state(PairView.of(batch), make_start(batch, MOTIONS), MODEL.fitted, InferenceConfig(clusters=4))
+    state = joint.first_state(PairView.of(batch), make_start(batch, MOTIONS), InferenceConfig(clusters=4))
     apart = replace(state, association=state.association.roll(1, -1))
 
     def at(of: joint.State, motions: Tensor) -> joint.State:

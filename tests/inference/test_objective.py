@@ -33,7 +33,7 @@ def padded_round(seed: int, candidates: int = 3) -> tuple[PairView, Start, State
     parameters = Parameters(*paper_weights(seed, seed + 1), Scales().double(), Boosters(1).double())
     view, start = PairView.of(batch), make_start(batch, MOTIONS)
     settings = InferenceConfig(clusters=4, candidates=candidates)
-    state = joint.first_state(view, start, parameters, settings)
+    state = joint.first_state(view, start, settings)
     return view, start, state, find_candidates(view, start.motions, start.active, settings), parameters
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import oracles
 import pytest
 import torch
-from scenes import random_stumps
+from scenes import make_batch, random_stumps
 from support import assert_close, extended, make_points, normal
 from torch import Tensor
 
@@ -57,18 +57,8 @@ def tiny(seed: int = 0) -> ScanPairBatch:
         if int(ASSOCIATION[0, i]) >= 0:
             target[0, ASSOCIATION[0, i]] = se2.apply(MOTIONS[CLUSTER[0, i]], source[0, i : i + 1])[0] + 0.1 * normal(2, seed=i)
     truth = Truth(ASSOCIATION.clone(), CLUSTER.clone(), MOTIONS[None, :2].clone(), torch.ones(1, N, dtype=torch.bool))
-    return ScanPairBatch(
-        source=source,
-        target=target,
-        source_mask=torch.ones(1, N, dtype=torch.bool),
-        target_mask=torch.ones(1, M, dtype=torch.bool),
-        source_closed=torch.zeros(1, dtype=torch.bool),
-        target_closed=torch.zeros(1, dtype=torch.bool),
-        dt=torch.full((1,), 0.1).double(),
-        range_noise=torch.full((1,), 0.01).double(),
-        initial_motion=torch.tensor([[0.02, -0.1, 0.0]], dtype=torch.float64),
-        truth=truth,
-    )
+    guess = torch.tensor([[0.02, -0.1, 0.0]], dtype=torch.float64)
+    return replace(make_batch(source, target), initial_motion=guess, truth=truth)
 
 
 def plugins_of(batch: ScanPairBatch) -> PlugIns:

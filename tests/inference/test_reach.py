@@ -132,9 +132,7 @@ def test_a_point_beyond_a_movers_reach_is_not_given_to_it(variant: str) -> None:
 def test_no_point_begins_in_a_mover_beyond_its_reach() -> None:
     batch, start, reach = begun()
     model = layer("hard")
-    hard, off = (
-        first_state(PairView.of(batch, reach=mode), start, model.fitted, model.config.inference) for mode in ("hard", "off")
-    )
+    hard, off = (first_state(PairView.of(batch, reach=mode), start, model.config.inference) for mode in ("hard", "off"))
     assert is_beyond(off.cluster, reach).any()
     assert not is_beyond(hard.cluster, reach).any()
     is_within = ~is_beyond(off.cluster, reach)
@@ -153,7 +151,7 @@ def test_a_mover_beyond_whose_reach_all_points_are_explains_none(backend: str) -
     def explained(mode: str, weight: float = 0.0) -> list[float]:
         model, view = layer(mode, weight), PairView.of(batch, reach=mode)
         config = replace(model.config.inference, backend=backend)
-        state = first_state(view, start, model.fitted, config)
+        state = first_state(view, start, config)
         return [float(of) for of in evidence(view, start, state, model.fitted, config)[0]]
 
     hard, soft, off = explained("hard"), explained("soft", 1e9), explained("off")

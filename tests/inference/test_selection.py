@@ -40,7 +40,7 @@ def test_evidence_equals_enumeration(seed: int) -> None:
     scales = Scales().double()
     parameters = Parameters(normal(len(ASSOCIATION_WEIGHTS), seed=1), weights, scales, Boosters(1).double())
     view = PairView.of(batch)
-    state = joint.first_state(view, start, parameters, CONFIG)
+    state = joint.first_state(view, start, CONFIG)
     found = evidence(view, start, state, parameters, CONFIG)
 
     nearest = torch.cdist(torch.stack([oracle_move(MOTIONS[c], batch.source[0]) for c in range(C)]), batch.target[0]).argmin(-1)
@@ -67,7 +67,7 @@ def test_a_cluster_that_explains_stays_and_one_that_does_not_goes() -> None:
     elsewhere = torch.tensor([[0.0, 30.0, 30.0]], dtype=torch.float64)
     start = judged(make_start(batch, torch.cat([MOTIONS[:2], elsewhere, MOTIONS[2:]])), [0.0, 0.0, 0.0]).considered()
     view = PairView.of(batch)
-    state = joint.first_state(view, start, MODEL.fitted, CONFIG)
+    state = joint.first_state(view, start, CONFIG)
     kept = discard_vacuous(view, start, state, MODEL.fitted, CONFIG).motions.active
     assert kept[0].tolist() == [True, True, False, True]
 
@@ -76,7 +76,7 @@ def test_of_two_that_explain_the_same_one_stays() -> None:
     batch, _ = scene(40, movers=1)
     start = judged(make_start(batch, torch.cat([MOTIONS[:2], MOTIONS[1:2] + 1e-4])), [1.0, 0.5]).considered()
     view = PairView.of(batch)
-    state = joint.first_state(view, start, MODEL.fitted, CONFIG)
+    state = joint.first_state(view, start, CONFIG)
     kept = discard_vacuous(view, start, state, MODEL.fitted, CONFIG).motions.active
     assert kept[0].tolist() == [True, True, False]
 
@@ -85,7 +85,7 @@ def test_the_background_always_stays() -> None:
     batch, _ = scene(20, movers=0)
     start = judged(make_start(batch, MOTIONS + 50.0), [-4.0, -4.0]).considered()
     view = PairView.of(batch)
-    state = joint.first_state(view, start, MODEL.fitted, CONFIG)
+    state = joint.first_state(view, start, CONFIG)
     kept = discard_vacuous(view, start, state, MODEL.fitted, CONFIG).motions.active
     assert kept[0].tolist() == [True, False, False]
 
@@ -99,7 +99,7 @@ def test_the_order_of_movers_does_not_matter() -> None:
     for motion, log_odds in ((motions, odds), (motions[order], [odds[k - 1] for k in order[1:]])):
         start = judged(make_start(batch, motion), log_odds).considered()
         view = PairView.of(batch)
-        state = joint.first_state(view, start, MODEL.fitted, CONFIG)
+        state = joint.first_state(view, start, CONFIG)
         kept.append(discard_vacuous(view, start, state, MODEL.fitted, CONFIG).motions.active[0])
     assert torch.equal(kept[1], kept[0][order])
 

@@ -75,7 +75,6 @@ def test_totals_equal_the_eager_ones(name: str) -> None:
     nodes, edges = CHAINS[name]
     before = nodes.copy(), edges.copy()
     whole, without = messages.log_partition_without(nodes, edges)
-    np.testing.assert_allclose(messages.log_partition(nodes, edges), eager_total(nodes, edges), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(whole, eager_total(nodes, edges), rtol=1e-9, atol=1e-9)
     for k in range(nodes.shape[1]):
         less = nodes.copy()
@@ -88,8 +87,8 @@ def test_totals_equal_the_eager_ones(name: str) -> None:
 def test_an_empty_chain() -> None:
     nothing = np.empty((0, 3)), np.empty((0, 3, 3))
     assert messages.max_marginals(*nothing).shape == (0, 3)
-    assert messages.log_partition(*nothing) == 0.0
-    assert messages.log_partition_without(*nothing)[1].tolist() == [0.0, 0.0, 0.0]
+    whole, without = messages.log_partition_without(*nothing)
+    assert [whole, *without] == [0.0] * 4
 
 
 def test_what_is_dropped_far_below_the_largest_may_still_decide() -> None:
@@ -97,4 +96,4 @@ def test_what_is_dropped_far_below_the_largest_may_still_decide() -> None:
     nodes, edges = np.zeros((3, 2)), np.zeros((2, 2, 2))
     nodes[0] = 0.0, -800.0
     edges[0, 0] = -2000.0
-    assert messages.log_partition(nodes, edges) == pytest.approx(-800 + 2 * math.log(2))
+    assert messages.log_partition_without(nodes, edges)[0] == pytest.approx(-800 + 2 * math.log(2))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import scenes
 import torch
 from support import assert_close, generator, make_points, normal
 from torch import Tensor
@@ -32,17 +33,7 @@ CHAINS = ("clustering", "matching")
 def make_batch(pairs: int, n: int = N, m: int = M) -> ScanPairBatch:
     source = torch.stack([make_points(n, seed) for seed in range(pairs)])
     target = torch.stack([make_points(m, seed + 50) for seed in range(pairs)])
-    return ScanPairBatch(
-        source=source,
-        target=target,
-        source_mask=torch.ones(pairs, n, dtype=torch.bool),
-        target_mask=torch.ones(pairs, m, dtype=torch.bool),
-        source_closed=torch.zeros(pairs, dtype=torch.bool),
-        target_closed=torch.zeros(pairs, dtype=torch.bool),
-        dt=torch.full((pairs,), 0.1).double(),
-        range_noise=torch.full((pairs,), 0.01).double(),
-        initial_motion=torch.zeros(pairs, 3).double(),
-    )
+    return scenes.make_batch(source, target)
 
 
 def random_case(chains: str, pairs: int = 4) -> tuple[ScanPairBatch, Start, Parameters]:

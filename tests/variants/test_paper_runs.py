@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from scenes import make_batch
 from support import assert_close, normal
 from torch import Tensor
 
-from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.features.potentials import PairView
 from torchcrf_scan.geometry import se2
@@ -14,21 +14,6 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.variants.paper_start import EXPLAINED, FEWEST, movers_from_associations, run_motions
 
 TRUE = torch.tensor([[0.1, -0.5, 0.2], [-0.3, 1.0, 0.4], [0.4, 0.0, -2.0]], dtype=torch.float64)
-
-
-def plain_batch(source: Tensor, target: Tensor) -> ScanPairBatch:
-    B = len(source)
-    return ScanPairBatch(
-        source=source,
-        target=target,
-        source_mask=torch.ones(source.shape[:2], dtype=torch.bool),
-        target_mask=torch.ones(target.shape[:2], dtype=torch.bool),
-        source_closed=torch.zeros(B, dtype=torch.bool),
-        target_closed=torch.zeros(B, dtype=torch.bool),
-        dt=torch.full((B,), 0.1).to(source),
-        range_noise=torch.full((B,), 0.01).to(source),
-        initial_motion=torch.zeros(B, 3).to(source),
-    )
 
 
 def row(n: int, x: float = 0.0) -> Tensor:
@@ -77,7 +62,7 @@ def test_many_short_runs_say_nothing() -> None:
 def test_movers_from_associations() -> None:
     source = torch.cat([row(20), row(6, 30.0)])[None]
     target = torch.cat([source[0, :20], source[0, 20:] + torch.tensor([2.0, 0.0]).double()])[None]
-    batch = plain_batch(source, target)
+    batch = make_batch(source, target)
     parameters = JointScanCRF().double().fitted
     association = torch.arange(26)[None].clone()
     association[0, 3] = -1
@@ -98,7 +83,7 @@ def test_the_papers_start_needs_no_more_than_a_model() -> None:
     target = source.clone()
     target[0, 20:] += torch.tensor([2.5, 0.0]).double()  # farther than one motion may be from both
     model = JointScanCRF(ModelConfig(start="paper", inference=InferenceConfig(clusters=5, candidates=0))).double()
-    start = model.initialise(plain_batch(source, target))
+    start = model.initialise(make_batch(source, target))
     assert start.motions.shape == (1, 4, 3)
     turn, shift = se2.distance(start.motions[0, 0], torch.zeros(3).double())
     assert float(turn) < 0.02

@@ -99,6 +99,9 @@ def test_a_model_begins_there_in_any_unit(name: str, chains: str, batch: ScanPai
     turn, shift = se2.distance(start.motions[:, 0], TRUE)
     assert (turn < 0.01).all()
     assert (shift < 0.05).all()
+    larger = begins.initialise(batch.scaled(torch.tensor([3.0, 0.1]).to(batch.dt)))
+    assert torch.equal(larger.association, start.association)
+    assert_close(larger.motions, start.scaled(torch.tensor([3.0, 0.1]).to(batch.dt)).motions)
 
 
 @pytest.mark.parametrize("look", list(LOOKS.values()), ids=list(LOOKS))

@@ -37,7 +37,7 @@ SEQUENCE, WEIGHT_SAME, WEIGHT_DIFFERENT, STIFFNESS_SAME, STIFFNESS_DIFFERENT, DI
 
 
 @kernel
-def pull_outlier(scene: Scene, state: State, tables: Tables, states: Integers, limit: float, slopes: Array, weights: Array) -> None:
+def pull_outlier(state: State, tables: Tables, states: Integers, limit: float, slopes: Array, weights: Array) -> None:
     """Adds the slopes of the outlier's weights. slopes: (N,) of its potentials; limit: residual that no motion explains."""
     for i in range(len(slopes)):
         least = np.inf
@@ -225,7 +225,7 @@ def pull_cluster(
     log_pairwise = transition_potentials(tables, states, log_unary, model)
     nodes, edges = pull_max_marginals(log_unary, log_pairwise, beliefs, to_beliefs)
     of_outlier, of_cluster = nodes[:, P].copy(), np.empty(N)
-    pull_outlier(scene, state, tables, states, model.outlier_threshold, of_outlier, weights)
+    pull_outlier(state, tables, states, model.outlier_threshold, of_outlier, weights)
     pull_edges(scene, state, tables, states, model, edges, weights, to_motions)
     is_limited = scene.limit.distance > 0
     near = nearest_to_all(scene.boxes, scene.source, state.motions, state.active) if is_limited else nearest

@@ -82,7 +82,7 @@ def do_rounds(pair: Pair, start: PairStart, extra: Extra, fitted: Fitted, settin
         return nothing_done(pair, start, last)
     is_chosen = not settings.is_joint or len(start.log_odds) == 0
     scene = scene_of(pair, start, *extra, settings)
-    now = first_state(scene, start, is_chosen, settings)
+    now = first_state(scene, start, is_chosen)
     caches = caches_of(scene, len(now.motions), settings.candidates)
     older, rounds, converged = now, list[Done](), False
     for done in range(settings.iterations):

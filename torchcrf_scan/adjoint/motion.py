@@ -20,6 +20,7 @@ from torchcrf_scan.fast.motion import (
     likely_members,
     places_of,
 )
+from torchcrf_scan.fast.robust import robust_weight
 from torchcrf_scan.inference.motion import ALONG, LARGEST_TURN, LEAST_DAMPING, SHIFT_DAMPING, TURN_DAMPING
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
 from torchcrf_scan.loops.kabsch import ROUNDING, mean_point
@@ -137,7 +138,7 @@ def pull_line(members: Members, start: Array, scale: float, slope: Array, to_wei
     for p in range(P):
         moved[p, 0], moved[p, 1] = transform(by, members.points[p, 0], members.points[p, 1])
         dx, dy = moved[p, 0] - members.partner[p, 0], moved[p, 1] - members.partner[p, 1]
-        robust[p] = 1 / (1 + (dx * dx + dy * dy) / scale**2)
+        robust[p] = robust_weight(dx * dx + dy * dy, scale)
     weights, to_moved, before = members.weights * robust, np.empty((P, 2)), np.empty(3)
     before[0], before[1], before[2] = pull_step(moved, members, weights, slope, start, to_moved, to_partner, to_weights)
     for p in range(P):

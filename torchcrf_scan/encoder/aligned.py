@@ -29,7 +29,8 @@ class Side:
 
     Attributes:
         points: (B, P, 2), mask: (B, P), sweep: of the scan. other, other_sweep: (B, Q, 2) points and sweep of the other scan.
-        motions: (B, C, 3). log_odds: (B, C) of the existence of each mover. reach: (B, P, C) of `Start`; None: by distance, `NEAR`.
+        motions: (B, C, 3). log_odds: (B, C) of the existence of each mover.
+        reach: (B, P, C) of `Start`, of the source; None: of the target, by distance, `NEAR`.
     """
 
     points: Tensor
@@ -59,7 +60,8 @@ def aligned_inputs(batch: ScanPairBatch, start: Start, backend: str = "auto", *,
     is_there = torch.where(start.active, torch.inf, -torch.inf).to(start.motions)
     log_odds = is_there if start.log_odds is None else start.log_odds
     motions, back = start.motions, se2.inverse(start.motions)
-    sides = [Side(batch.source, batch.source_mask, source, batch.target, target, motions, log_odds, start.reach)]
+    reach = motions.new_zeros(*batch.source.shape[:2], motions.shape[1]) if start.reach is None else start.reach
+    sides = [Side(batch.source, batch.source_mask, source, batch.target, target, motions, log_odds, reach)]
     if both:
         sides.append(Side(batch.target, batch.target_mask, target, batch.source, source, back, log_odds, None))
     return tuple(channels_of(side) for side in sides)
@@ -83,8 +85,7 @@ def own_channels(side: Side) -> tuple[Tensor, Tensor]:
     sweep = side.sweep
     ranges = torch.where(side.mask, sweep.ranges, 0.0)
     bearings = torch.where(side.mask, sweep.bearings, 0.0)
-    footprint = sweep.noise[:, None] + ranges * sweep.step[:, None]
-    unit = footprint.clamp(min=1e-9)
+    unit = (sweep.noise[:, None] + ranges * sweep.step[:, None]).clamp(min=1e-9)
     place = torch.arange(ranges.shape[1], device=ranges.device).expand_as(side.mask)
     found = []
     for k in BESIDE:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from torchcrf_scan.config import ModelConfig
+from torchcrf_scan.fast.boosting import double_array
 from torchcrf_scan.fast.clustering import ClusteringModel, clustering_model
 from torchcrf_scan.fast.free_space import Sweep
 from torchcrf_scan.fast.limit import Limit
@@ -107,7 +108,7 @@ class Scene(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of one pair after a round; `inference.joint.State`.
+    """State of one pair after a round; `inference.state.State`.
 
     Attributes:
         motions: (C, 3). active: (C,). empty_for: (C,). association, cluster: (N,).
@@ -131,8 +132,8 @@ def fitted_of(parameters: Parameters) -> Fitted:
         association_model(parameters),
         clustering_model(parameters),
         worth_of(parameters),
-        calibration.association.double().cpu().numpy().copy(),
-        calibration.cluster.double().cpu().numpy().copy(),
+        double_array(calibration.association),
+        double_array(calibration.cluster),
         float(calibration.covariance_factor),
     )
 

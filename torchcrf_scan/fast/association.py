@@ -13,6 +13,7 @@ from torchcrf_scan.fast.boosting import add_margins, margin
 from torchcrf_scan.fast.limit import Limit, log_within, sigmoid
 from torchcrf_scan.fast.robust import robust_square
 from torchcrf_scan.fast.static_features import AssociationModel, AssociationPair, Workspace, update_static
+from torchcrf_scan.features.association import ANOTHER_PLACE
 from torchcrf_scan.features.extension import FARTHEST_EXCESS
 from torchcrf_scan.features.scales import GATE_WIDTH, KAPPA
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
@@ -22,7 +23,6 @@ from torchcrf_scan.names import ASSOCIATION_WEIGHTS, LOCAL_CHANNELS, STATIC_CHAN
 
 REGISTERED = STATIC_CHANNELS  # L12
 BEST_MARGIN, LEAD = len(LOCAL_CHANNELS), len(LOCAL_CHANNELS) + 1  # inputs of the outlier booster
-ANOTHER_PLACE = 3  # target points away
 DATA_BOOSTING, OUTLIER_BOOSTING, EXCESS, GATE, OUTLIER_BIAS, SEEN_THROUGH, HIDDEN, SEQUENCE, SWITCH, STRETCH, SHIFT = (
     ASSOCIATION_WEIGHTS.index(name)
     for name in (

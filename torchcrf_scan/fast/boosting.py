@@ -48,16 +48,6 @@ def margin(stumps: Stumps, f: int, value: float) -> float:
 
 
 @kernel
-def margins(stumps: Stumps, first: int, phi: Array) -> float:
-    """Summed margin of the features `first` to `first + n`. phi: (n,)."""
-    total = 0.0
-    for f in range(len(phi)):
-        if stumps.is_live[first + f]:
-            total += margin(stumps, first + f, phi[f])
-    return total
-
-
-@kernel
 def add_margins(stumps: Stumps, f: int, values: Array, total: Array) -> None:
     """Adds the margin of feature f for many values at once; fast where thresholds are few. values, total: (P,)."""
     if not stumps.is_live[f]:

@@ -14,7 +14,7 @@ def can_run(backend: str, device: torch.device) -> bool:
     """Whether loops can replace tensors without gradient on a device.
 
     Raises:
-        ValueError: `backend` is `compiled`, and they cannot.
+        TorchCRFScanError: `backend` is `compiled`, and they cannot.
     """
     return _decide(backend, _why_not_here(device))
 

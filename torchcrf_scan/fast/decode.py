@@ -90,7 +90,7 @@ def certain(labels: Integers, states: int) -> Array:
 
 
 @entry
-def first_state(scene: Scene, start: PairStart, is_chosen: bool, settings: Settings) -> State:
+def first_state(scene: Scene, start: PairStart, is_chosen: bool) -> State:
     """The start as a state, all considered movers in it unless they are chosen; `cluster` and beliefs are not filled in yet."""
     N, C = len(scene.source), len(start.motions)
     active = start.active.copy()
@@ -243,7 +243,7 @@ def decode_pair(pair: Pair, start: PairStart, outlier: Array, moving: Array, fit
     """
     is_chosen = not settings.is_joint or len(start.log_odds) == 0
     scene = scene_of(pair, start, outlier, moving, settings)
-    state = first_state(scene, start, is_chosen, settings)
+    state = first_state(scene, start, is_chosen)
     state, converged, iterations = iterate(scene, state, start, is_chosen, fitted, settings)
     if settings.iterations == 0:
         state = first_beliefs(scene, state, settings.candidates)

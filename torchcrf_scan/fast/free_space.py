@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcrf_scan.features.free_space import SLACK_SHARE, SLACK_STEPS, WIDEST_GAP
+from torchcrf_scan.features.free_space import LEAST_SLACK, SLACK_SHARE, SLACK_STEPS, WIDEST_GAP
 from torchcrf_scan.loops.circle import (
     LEAST_TURN,
     USUAL_STEP,
@@ -20,8 +20,6 @@ from torchcrf_scan.loops.circle import (
 )
 from torchcrf_scan.loops.jit import Array, kernel
 from torchcrf_scan.search.free_space import range_slack
-
-LEAST_SLACK = 1e-6  # of `range_slack`
 
 
 class Sweep(NamedTuple):

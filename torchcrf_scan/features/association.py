@@ -9,10 +9,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchcrf_scan.features.scales import Scales, robust_square
+from torchcrf_scan.features.scales import KAPPA, Scales, robust_square
 from torchcrf_scan.features.shape import ShapeDescriptors, gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.names import ANGLES, DISTANCES, GEODESICS, LOCAL_CHANNELS, SHAPE_CHANNELS, STATIC_CHANNELS
+
+ANOTHER_PLACE = 3  # target points away
 
 
 def _of_candidates(values: Tensor, candidates: Tensor) -> Tensor:
@@ -77,17 +79,17 @@ def outlier_inputs(local: Tensor, data_margin: Tensor, candidates: Tensor, candi
     Args:
         local: (B, N, K, 12) channels of the candidates.
         data_margin: (B, N, K) data booster.
-        candidates, candidate_mask: (B, N, K); another place is 3 or more points away.
+        candidates, candidate_mask: (B, N, K); another place is `ANOTHER_PLACE` or more points away.
 
     Returns:
         (B, N, 14); without a candidate every channel is -kappa (the largest error) and the margin 0.
     """
     some = candidate_mask.any(-1)  # (B, N)
     best_local = local.masked_fill(~candidate_mask[..., None], -torch.inf).amax(-2)
-    best_local = torch.where(some[..., None], best_local, torch.full_like(best_local, -9.0))
+    best_local = torch.where(some[..., None], best_local, torch.full_like(best_local, -KAPPA))
     masked = data_margin.masked_fill(~candidate_mask, -torch.inf)
     best, place = masked.max(-1)
-    other = (candidates - candidates.gather(-1, place[..., None])).abs() >= 3
+    other = (candidates - candidates.gather(-1, place[..., None])).abs() >= ANOTHER_PLACE
     second = masked.masked_fill(~other, -torch.inf).amax(-1)
     gap = torch.where(second > -torch.inf, best - second, torch.zeros_like(best))
     gap = torch.where(some, gap, torch.zeros_like(gap))

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchcrf_scan.loops.circle import LEAST_TURN, USUAL_STEP
+from torchcrf_scan.loops.circle import BACKWARDS, LEAST_TURN, USUAL_STEP
 
 SLACK_STEPS = 3.0  # tolerance on a range, in beam spacings and noises,
 SLACK_SHARE = 0.02  # and as a share of the range: calibration, tilt
-BACKWARDS = 1e-4  # radians; smaller steps back are rounding errors
+LEAST_SLACK = 1e-6  # in the unit of the points
 WIDEST_GAP = 2.5  # beam steps; between returns farther apart the scan holds no information
 
 
@@ -102,7 +102,7 @@ def look(scan: Sweep, points: Tensor) -> FreeSpace:
         near = torch.minimum(scan.ranges.gather(1, left), scan.ranges.gather(1, right))
         far = torch.maximum(scan.ranges.gather(1, left), scan.ranges.gather(1, right))
     slack = SLACK_STEPS * (scan.noise[:, None] + ranges * step) + SLACK_SHARE * ranges
-    slack = slack.clamp(min=1e-6)
+    slack = slack.clamp(min=LEAST_SLACK)
     seen_through = ((near - ranges) / slack - 1).clamp(0, 1) * measured
     hidden = torch.where(inside, ((ranges - far) / slack - 1).clamp(0, 1) * measured, torch.ones_like(ranges))
     return FreeSpace(seen_through.view(shape), hidden.view(shape))

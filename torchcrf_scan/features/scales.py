@@ -16,9 +16,8 @@ from torchcrf_scan.names import (
     SCALED_EDGES,
 )
 
-GATE_WIDTH = 0.05
+GATE_WIDTH = 0.05  # of the sigmoid at the gate of outliers, as a share of the gate
 KAPPA = 9.0  # cap of robust squares: three standard deviations (spec 0.1)
-
 
 # Scales before any fitting, metres or radians.
 LOCAL = {

@@ -96,7 +96,7 @@ def rounds(
     batch, config = view.batch, model.inference
     is_chosen = config.movers == "threshold" or start.log_odds is None or not model.has_clusters
     start = start if is_chosen else start.considered()
-    state = first_state(view, start, parameters, config)
+    state = first_state(view, start, config)
     before = state
     converged = torch.zeros_like(batch.source_closed)
     iterations = torch.zeros_like(converged, dtype=torch.int64)
@@ -117,7 +117,7 @@ def rounds(
     return found
 
 
-def first_state(view: PairView, start: Start, parameters: Parameters, config: InferenceConfig) -> State:
+def first_state(view: PairView, start: Start, config: InferenceConfig) -> State:
     """The start as a state: every point is in the cluster whose motion brings it closest to a target point."""
     batch = view.batch
     found = find_candidates(view, start.motions, start.active, config)
@@ -234,7 +234,7 @@ def association_at(view: PairView, state: State, found: Candidates, parameters: 
 
 def associate(view: PairView, start: Start, cluster: Tensor, parameters: Parameters, config: InferenceConfig) -> Tensor:
     """(B, N) associations of one exact pass over the association chain at the start's motions. cluster: (B, N), -1 outlier."""
-    state = first_state(view, start, parameters, config)
+    state = first_state(view, start, config)
     one_hot = torch.nn.functional.one_hot(cluster.clamp(min=0), start.motions.shape[1] + 1).to(start.motions)
     found = find_candidates(view, start.motions, start.active, config)
     return update_association(view, replace(state, log_cluster=one_hot), found, parameters, config).association

@@ -83,14 +83,13 @@ def motion_covariance(
     information, vectors = torch.linalg.eigh(normal.detach())
     seen = vectors * (information >= LEAST_SHARE)[..., None, :]
     keep = seen @ vectors.mT  # projection onto the observed directions
-    pretended = (
-        LEAST_SHARE if MOTION_METRICS[metric].along_surface else 0.0
-    )  # by the residual noise of the tangents, and by steps along the surface
+    along_surface = MOTION_METRICS[metric].along_surface
+    pretended = LEAST_SHARE if along_surface else 0.0  # by the tangents' noise, and by steps along the surface
     bread = keep @ (normal - pretended * identity) @ keep * total[..., None, None]
     extent = at.length.double()
     prior = torch.stack([3 / (torch.pi * extent) ** 2, *(1 / reach[:, None] ** 2).expand(2, *extent.shape)], -1).diag_embed()
     local = torch.linalg.inv(bread @ torch.linalg.inv(meat) @ bread + prior)
-    if MOTION_METRICS[metric].along_surface:
+    if along_surface:
         local = local + shared_error(source, at, spread, noise)[..., None, None].double() * identity
     covariance = about_origin(local, extent, (motions[..., 1:] - at.centre).double())
     return Uncertainty(covariance.to(source), information.to(source), vectors.mT.to(source))

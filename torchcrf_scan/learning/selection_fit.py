@@ -48,7 +48,7 @@ def judge_clusters(model: JointScanCRF, part: Material) -> tuple[Tensor, Tensor]
     view = model.view(part.batch, model.learned_inputs(part.batch, part.start))
     start = view.in_unit(part.start).considered()
     parameters, config = model.fitted, model.config.inference
-    state = joint.first_state(view, start, parameters, config)
+    state = joint.first_state(view, start, config)
     assert start.log_odds is not None
     terms = ClusterPotential.terms(evidence(view, start, state, parameters, config), start.log_odds)
     found = find_candidates(view, state.motions.value, state.motions.active, config)

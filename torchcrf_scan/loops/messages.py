@@ -306,19 +306,6 @@ def log_partition_without(log_unary: Array, log_pairwise: Array) -> tuple[float,
 
 
 @kernel
-def log_partition(log_unary: Array, log_pairwise: Array) -> float:
-    """Log of the summed score of all labellings, at temperature 1. Arguments as in `max_marginals`."""
-    N, S = log_unary.shape
-    states = possible_states(log_unary)
-    if N == 0 or len(states) == 0:
-        return 0.0 if N == 0 else -np.inf
-    none = np.full(1, -1)
-    if len(states) == S:
-        return float(_totals(log_unary, log_pairwise, none)[0])
-    return float(_totals(_chosen_nodes(log_unary, states), _chosen_edges(log_pairwise, states), none)[0])
-
-
-@kernel
 def _backward_sums(nodes: Array, edges: Array, scale: Array) -> Array:
     """(N, S) sums over all that comes after a node, in every state of it, over the scales (N,) of the forward sums."""
     N, S = nodes.shape

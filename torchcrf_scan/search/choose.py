@@ -123,7 +123,7 @@ def _reach(points: Array, members: Integers, unit: float, beyond: Array) -> None
                 least, last = dx * dx + dy * dy, place
                 if least <= near:
                     break
-        beyond[i] = 0.0 if least <= near else max(math.sqrt(least) / reach - 1, 1e-15)
+        beyond[i] = 0.0 if least <= near else max(math.sqrt(least) / reach - 1, 1e-15)  # beyond, if only by rounding
 
 
 @kernel

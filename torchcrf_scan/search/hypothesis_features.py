@@ -33,10 +33,7 @@ from torchcrf_scan.search.target_features import target_features, target_scan_of
 
 AROUND = 15  # beams
 RIVALS = 0.7  # share of common points above which two hypotheses are rivals
-USUAL_UNITS, USUAL_COUNT = (
-    2.0,
-    3.0,
-)  # units in all, and of how many points, that are added to those around, a prior against few points
+USUAL_UNITS, USUAL_COUNT = 2.0, 3.0  # units in all, and number of points, added to those around: a prior against few points
 
 
 @entry

@@ -55,6 +55,8 @@ STREETS_AND_ROOMS = {
     "landing_stands_out": (0.081, 0.484, 0.329, 0.094),
 }
 
+FEATURES = tuple(STREETS_AND_ROOMS)  # the order of every vector of features
+
 BIAS, THRESHOLD = -5.785, 0.4
 
 PRODUCTS = {  # of two standardised features: the weight
@@ -104,50 +106,3 @@ class HypothesisScore(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """(..., F) features of `hypothesis_features` -> (...) probabilities."""
         return (self.terms(features) @ self.weight + self.bias).sigmoid()
-
-
-FEATURES = (
-    "size",
-    "share_of_segment",
-    "extent",
-    "linearity",
-    "range",
-    "residual",
-    "gain",
-    "total_gain",
-    "explained",
-    "open_before",
-    "occluded_before",
-    "seen_through_before",
-    "seen_through",
-    "occluded",
-    "distinct",
-    "landing_open",
-    "landing_seen_through_before",
-    "target_open",
-    "target_residual",
-    "target_gain",
-    "target_total_gain",
-    "target_cover",
-    "displacement",
-    "displacement_in_spacings",
-    "displacement_in_range",
-    "displacement_in_extent",
-    "along_surface",
-    "rotation",
-    "gain_both_ways",
-    "residual_to_best",
-    "total_gain_to_best",
-    "target_total_gain_to_best",
-    "units_around",
-    "scene_open",
-    "unexcused",
-    "landing_unexcused",
-    "unexcused_both",
-    "landing_occluded_before",
-    "fair_gain",
-    "share_of_piece",
-    "landing_piece_cover",
-    "stands_out",
-    "landing_stands_out",
-)

@@ -33,19 +33,19 @@ class Backed:
     is_found: bool
 
 
-def choose_background(found: Floats, guess: Floats, grid: ScanGrid, reference: ScanGrid) -> Backed:
+def choose_background(found: Floats, guess: Floats, source: ScanGrid, target: ScanGrid) -> Backed:
     """The motion found (3,), unless the guess (3,) or standing still explain far more returns; any more, if it is far turned."""
-    first = _backed(found, grid, reference, True)
+    first = _backed(found, source, target, True)
     least = LEAST_OF_BEST if abs(se2.wrap(found[0] - guess[0])) < LARGE_TURN else LEAST_TURNED
     if first.share >= least:  # whatever the other candidates explain
         return first
     starts = np.stack([guess, np.zeros(3)])
-    others = [_backed(motion, grid, reference, False) for motion in (*starts, *refine(starts, grid, reference))]
+    others = [_backed(motion, source, target, False) for motion in (*starts, *refine(starts, source, target))]
     best = max(others, key=lambda backed: backed.share)
     return first if first.share >= least * best.share else best
 
 
-def _backed(motion: Floats, grid: ScanGrid, reference: ScanGrid, is_found: bool) -> Backed:
-    left = leftover_of(grid, reference, motion)
+def _backed(motion: Floats, source: ScanGrid, target: ScanGrid, is_found: bool) -> Backed:
+    left = leftover_of(source, target, motion)
     explained, back = (side.residual < TIGHT for side in (left.source, left.target))
     return Backed(motion, explained, float(min(explained.mean(), back.mean())), is_found)

@@ -20,7 +20,6 @@ from torchcrf_scan.features.candidates import Candidates
 from torchcrf_scan.features.potentials import (
     AssociationStates,
     PairView,
-    association_potentials,
     association_unary,
     clustering_potentials,
     clustering_unary,
@@ -31,7 +30,7 @@ from torchcrf_scan.features.potentials import (
 )
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.inference import joint
-from torchcrf_scan.inference.messages import normalise, reduce_states
+from torchcrf_scan.inference.messages import normalise, normalise_beliefs, reduce_states
 from torchcrf_scan.inference.motion import RunningSums, retire_empty
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import Parameters, State
@@ -102,7 +101,7 @@ class Flooding:
 
     def __init__(self, view: PairView, start: Start, parameters: Parameters, model: ModelConfig) -> None:
         self.view, self.start, self.parameters, self.model = view, start, parameters, model
-        self.state = joint.first_state(view, start, parameters, model.inference)
+        self.state = joint.first_state(view, start, model.inference)
         B, N = view.batch.source.shape[:2]
         self.cluster_messages = Messages.zeros(B, N, self.state.log_cluster.shape[-1], view.batch.source)
         self.association_messages = Messages.zeros(B, N, self.state.log_association.shape[-1], view.batch.source)
@@ -142,12 +141,12 @@ class Flooding:
         if self.model.has_clusters:
             belief = self.cluster_messages.joined(self._cluster_potentials(everything, found)[0])
             labels = joint.cluster_labels(belief.argmax(-1), belief.shape[-1] - 1, mask)
-            self.state = replace(self.state, log_cluster=self._normalised(belief), cluster=labels)
+            self.state = replace(self.state, log_cluster=normalise_beliefs(belief, self.config.temperature), cluster=labels)
         if self.model.has_association:
             self._take_candidates(found)
             belief = self.association_messages.joined(self._association_unary(everything))
             labels = joint.association_labels(belief.argmax(-1), found.index, mask)
-            self.state = replace(self.state, log_association=self._normalised(belief), association=labels)
+            self.state = replace(self.state, log_association=normalise_beliefs(belief, self.config.temperature), association=labels)
             if not self.model.has_clusters:
                 self.state = joint.inliers_are_background(self.state)
 
@@ -162,7 +161,7 @@ class Flooding:
         after = edges[:, k] if k < edges.shape[1] else None
         belief = self._send(self.cluster_messages, i, unary[:, k], before, after)
         log_cluster = state.log_cluster.clone()
-        log_cluster[:, here] = self._normalised(belief)[:, None]
+        log_cluster[:, here] = normalise_beliefs(belief, self.config.temperature)[:, None]
         cluster = state.cluster.clone()
         cluster[:, here] = joint.cluster_labels(belief[:, None].argmax(-1), belief.shape[-1] - 1, batch.source_mask[:, here])
         self._relabel(i, replace(state, log_cluster=log_cluster, cluster=cluster))
@@ -176,7 +175,7 @@ class Flooding:
         after = self.edges[:, i] if i < self.edges.shape[1] else None
         belief = self._send(self.association_messages, i, unary, before, after)
         log_association = state.log_association.clone()
-        log_association[:, here] = self._normalised(belief)[:, None]
+        log_association[:, here] = normalise_beliefs(belief, self.config.temperature)[:, None]
         association = state.association.clone()
         association[:, here] = joint.association_labels(belief[:, None].argmax(-1), candidates, batch.source_mask[:, here])
         state = replace(state, log_association=log_association, association=association)
@@ -215,10 +214,6 @@ class Flooding:
             messages.backward[:, i - 1] = said.masked_fill(~mask[:, i, None], 0.0)
         return unary + messages.forward[:, i] + messages.backward[:, i]
 
-    def _normalised(self, belief: Tensor) -> Tensor:
-        """Log-beliefs normalised as in `chain_beliefs`."""
-        return torch.log_softmax(belief / self.config.temperature if self.config.temperature else belief, -1)
-
     def _relabel(self, i: int, state: State) -> None:
         """ComputeRT after node i changed its label or partner, in O(1) (spec 7.4)."""
         target, C = self.view.batch.target, state.motions.value.shape[1]
@@ -252,13 +247,9 @@ class Flooding:
             carried = torch.where(same.any(-1), carried, least)
             setattr(self.association_messages, name, torch.cat([carried, message[..., -1:]], dim=-1))
         self.states = AssociationStates.of(self.view, found.index, found.mask, scales, self.parameters.boosters)
-        pairwise = pairwise_features(batch.source, batch.target, found.index, scales)
-        none = pairwise.new_zeros(*found.index.shape, ASSOCIATION_UNARY)
-        _, self.edges = association_potentials(
-            torch.cat([none, none[:, :, :1]], dim=2), pairwise, found.mask, self.parameters.association
-        )
-        log = self.state.log_association
-        self.state = replace(self.state, candidates=found.index, candidate_mask=found.mask, log_association=log)
+        pairwise = pairwise_features(batch.source, batch.target, found.index, scales, has_lengths=self.view.has_lengths)
+        self.edges = pairwise @ self.parameters.association[ASSOCIATION_UNARY:]
+        self.state = replace(self.state, candidates=found.index, candidate_mask=found.mask)
 
     def _retire_empty(self) -> None:
         """Removes clusters without a point for two iterations (spec 7.5)."""

@@ -155,6 +155,7 @@ def lattice_features(
     registered = torch.cat([registered, best[..., None]], dim=-1)  # (B, N, K, D)
     of_association, of_cluster = extension_channels(view, states, at, distance, motions, possible, scales, reach)
     residual = at.residual.masked_fill(~possible[..., :-1], torch.inf).amin(-1)
+    scans = batch.source, batch.target
     return LatticeFeatures(
         static=unary_at(states, best, scales, boosters, margin)[..., list(STATIC_WEIGHTS)],
         moving=torch.cat(
@@ -166,7 +167,7 @@ def lattice_features(
             ],
             dim=-1,
         ),
-        pairwise_association=association.pairwise_features(batch.source, batch.target, states.candidates, scales),
+        pairwise_association=association.pairwise_features(*scans, states.candidates, scales, has_lengths=view.has_lengths),
         elastic=elastic_features(batch.source, partner, scales),
         pairwise_cluster=clustering.pairwise_features(batch.source, at, scales),
         mask=state_mask(states.mask)[..., None] & possible[:, :, None],

@@ -21,10 +21,10 @@ from torchcrf_scan.loops.pair import array_of
 from torchcrf_scan.names import ASSOCIATION_NODE, SHAPE, SHAPE_CHANNELS
 from torchcrf_scan.search.cold import ransac_motions
 
-INDEX_GAP = 3
-SPATIAL_GAP = 0.75  # metres, as the next two: sizes for the paper's car and scanner
+INDEX_GAP = 3  # points
+SPATIAL_GAP = 0.75  # as the next one in the unit of the features: metres for the paper, which says `length_unit: metre`
 EXPLAINED = 0.3
-FEWEST = 4
+FEWEST = 4  # points of a run
 ROUNDS = 3
 COLD_CANDIDATES = 32
 
