@@ -13,14 +13,14 @@ import numpy as np
 import torch
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.causes.movers import TrueMover
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.inference.start import Start, beyond_reach, nearest_association
 from torchcrf_scan.loops.pair import pair_of
 from torchcrf_scan.loops.shape import resolution
 from torchcrf_scan.model import JointScanCRF
-from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, PairPrediction, ScanPair
+from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, PairPrediction, ScanPair
 from torchcrf_scan.search.accept import score_of
 from torchcrf_scan.search.pairs import start_from, start_tensors
 from torchcrf_scan.search.survey import grids_of, survey_at
@@ -56,13 +56,6 @@ def with_true_motions(model: JointScanCRF, pair: ScanPair, trace: SearchTrace) -
     rows = [background if np.isfinite(background).all() else trace.background, *(of.motion for of in movers.values())]
     members = np.array([of.is_member for of in movers.values()], dtype=bool).reshape(len(movers), len(pair.source))
     return _from(_at_given_motions(model), pair, np.stack(rows), members)
-
-
-def annotation_of(pair: ScanPair) -> Annotation:
-    """The annotation; raises ValueError for a pair without one."""
-    if pair.annotation is None:
-        raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
-    return pair.annotation
 
 
 def _movers(pair: ScanPair, trace: SearchTrace) -> dict[int, TrueMover]:

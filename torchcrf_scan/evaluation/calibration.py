@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri  # quantiles of chi-square; `scipy.stats` takes a second to import
 
 from torchcrf_scan.errors import TorchCRFScanError
-from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers, relabel
+from torchcrf_scan.evaluation.counterparts import annotation_of, beams_apart, match_movers, relabel
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, Bools, Floats, PairPrediction, ScanPair
 
@@ -136,13 +136,10 @@ class Rightness:
 
 def rightness(pair: ScanPair, prediction: PairPrediction, tolerance: int = 2) -> Rightness:
     """Compares a prediction with the pair's annotation. Raises ValueError for a pair without one."""
-    if pair.annotation is None:
-        raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
-    beam = pair.source.beam
-    known = ~pair.annotation.ignore[beam]
-    truth, answer = pair.annotation.association[beam], prediction.association[beam]
-    off = beams_apart(pair.target, truth, answer)
-    cluster, found = pair.annotation.cluster[beam], prediction.cluster[beam]
+    truth, beam = annotation_of(pair), pair.source.beam
+    known = ~truth.ignore[beam]
+    off = beams_apart(pair.target, truth.association[beam], prediction.association[beam])
+    cluster, found = truth.cluster[beam], prediction.cluster[beam]
     numbered = relabel(found, cluster, match_movers(cluster[known], found[known]))
     return Rightness(known, off == 0, off <= tolerance, numbered == cluster)
 

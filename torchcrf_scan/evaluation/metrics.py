@@ -14,7 +14,7 @@ from rapidfuzz.distance import Levenshtein
 
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import Sureness
-from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers, relabel
+from torchcrf_scan.evaluation.counterparts import annotation_of, beams_apart, match_movers, relabel
 from torchcrf_scan.evaluation.measures import EVERY, Count, Labelled
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
@@ -180,9 +180,7 @@ def edit_distance(labels: Ints, others: Ints, substitution: int) -> int:
 
 
 def _checked_annotation(pair: ScanPair, prediction: PairPrediction) -> Annotation:
-    n, m = pair.source.n_beams, pair.target.n_beams
-    if pair.annotation is None:
-        raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
+    truth, n, m = annotation_of(pair), pair.source.n_beams, pair.target.n_beams
     if prediction.association.shape != (n,) or prediction.cluster.shape != (n,):
         got = f"association {prediction.association.shape} and cluster {prediction.cluster.shape}"
         raise TorchCRFScanError(f"prediction of pair {pair.name!r}: expected labels of all ({n},) source beams, got {got}")
@@ -190,7 +188,7 @@ def _checked_annotation(pair: ScanPair, prediction: PairPrediction) -> Annotatio
         raise TorchCRFScanError(
             f"prediction of pair {pair.name!r}: expected association below {m}, got {prediction.association.max()}"
         )
-    return pair.annotation
+    return truth
 
 
 def _label_score(labels: Ints, predicted: Ints) -> LabelScore:
