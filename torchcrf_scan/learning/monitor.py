@@ -149,7 +149,7 @@ class TrainingMonitor:
             "pair/clusters": plot_clusters(pair, first),
             "pair/confidence": plot_confidence(pair, joint_answer),
             "all/reliability": plot_reliability({name: of for name, of in by_kind.items() if len(of[0])}),
-            "all/moving points": plot_precision_recall({"joint": moving_points(answers)}),
+            "all/moving points": plot_precision_recall(*moving_points(answers)),
         }
         for name, figure in figures.items():
             self.writer.add_figure(name, figure, step, close=False)
