@@ -27,6 +27,7 @@ from torchcrf_scan.viz.marks import (
     STATIC,
     TARGET,
     draw_arrows,
+    draw_box,
     draw_dots,
     draw_lines,
     draw_outliers,
@@ -154,8 +155,7 @@ def _draw_associations(ax: Axes, scene: Scene, answer: Answer, title: str) -> No
     draw_frame(ax, scene.window, title, f"{outliers} outliers", _mistakes(answer.wrong_association, scene))
     _associations(ax, scene, answer, size=2.4)
     if scene.zoom is not None:
-        (x, y), (x_end, y_end) = scene.zoom
-        ax.plot([x, x_end, x_end, x, x], [y, y, y_end, y_end, y], color=INK, lw=0.8, ls=(0, (4, 3)), zorder=5)
+        draw_box(ax, scene.zoom)
     draw_sensor(ax, np.zeros(2), INK)
 
 
