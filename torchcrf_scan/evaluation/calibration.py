@@ -123,13 +123,11 @@ class Rightness:
 
     Attributes:
         known: (N,) annotated returns; the others are not scored.
-        exact: (N,) the true target beam, or a true outlier.
         within: (N,) at most `tolerance` target beams off, or a true outlier.
         cluster: (N,) the true cluster, movers matched by overlap.
     """
 
     known: Bools
-    exact: Bools
     within: Bools
     cluster: Bools
 
@@ -141,7 +139,7 @@ def rightness(pair: ScanPair, prediction: PairPrediction, tolerance: int = 2) ->
     off = beams_apart(pair.target, truth.association[beam], prediction.association[beam])
     cluster, found = truth.cluster[beam], prediction.cluster[beam]
     numbered = relabel(found, cluster, match_movers(cluster[known], found[known]))
-    return Rightness(known, off == 0, off <= tolerance, numbered == cluster)
+    return Rightness(known, off <= tolerance, numbered == cluster)
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,13 +32,12 @@ class Judged:
 
     Attributes:
         association_log_odds, cluster_log_odds: (P,).
-        association_right, association_exact, cluster_right: (P,) bool; right is within `WITHIN` target beams.
+        association_right, cluster_right: (P,) bool; an association is right within `WITHIN` target beams.
         nees: (Q,) normalised estimation errors squared of the background's motion.
     """
 
     association_log_odds: Floats
     association_right: Bools
-    association_exact: Bools
     cluster_log_odds: Floats
     cluster_right: Bools
     nees: Floats
@@ -47,7 +46,7 @@ class Judged:
     def nothing(cls) -> Judged:
         """An instance without returns and pairs."""
         number, flag = np.zeros(0), np.zeros(0, dtype=bool)
-        return cls(number, flag, flag, number, flag, number)
+        return cls(number, flag, number, flag, number)
 
     @classmethod
     def joined(cls, parts: Sequence[Judged]) -> Judged:
@@ -109,7 +108,6 @@ def judge(pairs: Sequence[ScanPair], prediction: Prediction, counts: Sequence[bo
             Judged(
                 association_log_odds=association[b, :n].double().cpu().numpy()[known],
                 association_right=right.within[known],
-                association_exact=right.exact[known],
                 cluster_log_odds=cluster[b, :n].double().cpu().numpy()[known],
                 cluster_right=right.cluster[known],
                 nees=nees[np.isfinite(nees)],

@@ -28,7 +28,7 @@ from torchcrf_scan.learning.material import Material
 from torchcrf_scan.learning.scales_fit import fit_scales
 from torchcrf_scan.learning.selection_fit import fit_potential, judge_clusters
 from torchcrf_scan.learning.settings import LearningConfig
-from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.model import JointScanCRF, with_config
 from torchcrf_scan.scan import Floats, ScanPair
 
 FOLDS = 5  # at most
@@ -120,14 +120,9 @@ def folds_of(pairs: Sequence[ScanPair]) -> list[list[int]]:
     return [part.tolist() for part in np.array_split(np.arange(len(pairs)), min(FOLDS, len(pairs)))]
 
 
-def wrong_points(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
-    """(P,) annotated points of every pair whose association is more than two beams off or whose cluster is wrong."""
-    return errors(model, pairs)[:, 0]
-
-
 @torch.no_grad()
 def errors(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
-    """(P, 3) `wrong_points`, points wrongly called outliers or not, and points of movers called none's, of every pair."""
+    """(P, 3) wrong annotated points of every pair: by association or cluster, by outlier decision, movers' points called static."""
     found = []
     for pair, answer in zip(pairs, model.match_pairs(pairs), strict=True):
         assert pair.annotation is not None
@@ -147,9 +142,7 @@ def gains(before: Floats, after: Floats) -> bool:
 
 def with_distance(model: JointScanCRF, metres: float) -> JointScanCRF:
     """A copy of the model with this distance of outliers."""
-    other = copy.copy(model)
-    other.config = model.config.with_limit(metres)
-    return other
+    return with_config(model, model.config.with_limit(metres))
 
 
 def fit_distance(model: JointScanCRF, given: Given) -> tuple[JointScanCRF, Part]:
