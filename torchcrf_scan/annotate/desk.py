@@ -40,7 +40,7 @@ class Desk:
         name: of the open pair. error: what could not be saved, one line, empty if nothing.
 
     Raises:
-        ValueError: the folder holds a pair of the same name with other scans.
+        TorchCRFScanError: the folder holds a pair of the same name with other scans.
     """
 
     def __init__(

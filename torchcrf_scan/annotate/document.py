@@ -113,7 +113,7 @@ def assign(document: Document, points: Ints, label: int) -> Document:
     """Gives points to the background, an outlier's or unknown label, or to a mover; fits the motions that this concerns.
 
     Raises:
-        ValueError: a mover beyond the next free number.
+        TorchCRFScanError: a mover beyond the next free number.
     """
     if not UNKNOWN <= label <= min(len(document.motions), MOST_MOVERS):
         raise TorchCRFScanError(f"expected a mover up to {min(len(document.motions), MOST_MOVERS)}, got {label}")

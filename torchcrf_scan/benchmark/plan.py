@@ -89,7 +89,7 @@ def place_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def choose_backends(wanted: Sequence[str]) -> tuple[str, ...]:
-    """The backends wanted, by default all. Raises ValueError for an unknown one."""
+    """The backends wanted, by default all. Raises TorchCRFScanError for an unknown one."""
     for name in wanted:
         if name not in BACKENDS:
             raise TorchCRFScanError(f"--backends: expected some of {', '.join(BACKENDS)}, got {name}")

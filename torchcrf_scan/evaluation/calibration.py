@@ -41,7 +41,7 @@ def reliability(confidence: ArrayLike, is_right: ArrayLike, bins: int = BINS) ->
         confidence: (P,) in [0, 1]. is_right: (P,) bool.
 
     Raises:
-        ValueError: other shapes, confidences outside [0, 1], no bins.
+        TorchCRFScanError: other shapes, confidences outside [0, 1], no bins.
     """
     confidences, right = np.asarray(confidence, dtype=np.float64), np.asarray(is_right, dtype=bool)
     if confidences.ndim != 1 or confidences.shape != right.shape:
@@ -101,7 +101,7 @@ class Consistency:
 
 
 def consistency(nees: ArrayLike, freedom: int = MOTION_FREEDOM, level: float = 0.95) -> Consistency:
-    """Compares normalised errors (P,) with the chi-square distribution. Raises ValueError for empty input."""
+    """Compares normalised errors (P,) with the chi-square distribution. Raises TorchCRFScanError for empty input."""
     values = np.asarray(nees, dtype=np.float64)
     if values.ndim != 1 or not len(values):
         raise TorchCRFScanError(f"nees: expected at least one number (P,), got {values.shape}")
@@ -133,7 +133,7 @@ class Rightness:
 
 
 def rightness(pair: ScanPair, prediction: PairPrediction, tolerance: int = 2) -> Rightness:
-    """Compares a prediction with the pair's annotation. Raises ValueError for a pair without one."""
+    """Compares a prediction with the pair's annotation. Raises TorchCRFScanError for a pair without one."""
     truth, beam = annotation_of(pair), pair.source.beam
     known = ~truth.ignore[beam]
     off = beams_apart(pair.target, truth.association[beam], prediction.association[beam])
@@ -160,7 +160,7 @@ class Sureness:
 
     @classmethod
     def of(cls, pair: ScanPair, prediction: PairPrediction) -> Sureness:
-        """Compares a prediction with the pair's annotation. Raises ValueError for a pair without one."""
+        """Compares a prediction with the pair's annotation. Raises TorchCRFScanError for a pair without one."""
         right = rightness(pair, prediction)
         beam = pair.source.beam[right.known]
         return cls(

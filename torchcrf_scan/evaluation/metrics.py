@@ -135,7 +135,7 @@ class PairScore:
 
 
 def score_pairs(pairs: Sequence[ScanPair], predictions: Sequence[PairPrediction]) -> list[PairScore]:
-    """Scores the predictions of annotated pairs; raises ValueError as `score_pair`, or for another number of them."""
+    """Scores the predictions of annotated pairs, as many as pairs; raises TorchCRFScanError as `score_pair`."""
     return [score_pair(pair, prediction) for pair, prediction in zip(pairs, predictions, strict=True)]
 
 
@@ -143,7 +143,7 @@ def score_pair(pair: ScanPair, prediction: PairPrediction) -> PairScore:
     """Scores the prediction of an annotated pair.
 
     Raises:
-        ValueError: a pair without annotation, or a prediction with another number of beams or with invalid target beams.
+        TorchCRFScanError: a pair without annotation, or a prediction with another number of beams or with invalid target beams.
     """
     truth = _checked_annotation(pair, prediction)
     keep = pair.source.beam[~truth.ignore[pair.source.beam]]  # counter-clockwise, whatever the beams' order

@@ -64,7 +64,7 @@ class NeighbourScore:
 
     @classmethod
     def of(cls, pair: ScanPair, prediction: PairPrediction) -> NeighbourScore:
-        """The counts of an annotated pair; raises ValueError for a pair without annotation."""
+        """The counts of an annotated pair; raises TorchCRFScanError for a pair without annotation."""
         right: Rightness = rightness(pair, prediction)
         known = right.known
         flow, panoptic = FlowErrors.of(pair, prediction), PanopticCount.of(pair, prediction)

@@ -43,7 +43,7 @@ class PanopticCount:
 
     @classmethod
     def of(cls, pair: ScanPair, prediction: PairPrediction) -> PanopticCount:
-        """The movers of an annotated pair; raises ValueError for a pair without annotation."""
+        """The movers of an annotated pair; raises TorchCRFScanError for a pair without annotation."""
         truth, beam = annotation_of(pair), pair.source.beam
         cluster = truth.cluster[beam]
         return count_segments(cluster, prediction.cluster[beam], truth.ignore[beam] | (cluster == OUTLIER))

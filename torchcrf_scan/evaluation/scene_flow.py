@@ -57,7 +57,7 @@ class FlowErrors:
 
     @classmethod
     def of(cls, pair: ScanPair, prediction: PairPrediction) -> FlowErrors:
-        """The errors of an annotated pair; raises ValueError for a pair without annotation.
+        """The errors of an annotated pair; raises TorchCRFScanError for a pair without annotation.
 
         A cluster without a finite answered motion moves with the answered background, and that, if it is unknown, not at all.
         """

@@ -37,7 +37,7 @@ def summarise(scores: Sequence[PairScore]) -> dict[str, float]:
     `target_distance`, errors, `_ece` and `nees_` are NaN when there is nothing to average; no other key ever is.
 
     Raises:
-        ValueError: no scores.
+        TorchCRFScanError: no scores.
     """
     if not scores:
         raise TorchCRFScanError("scores: expected at least one pair, got none")

@@ -54,7 +54,7 @@ def relative_error(poses: Floats, reference: Floats, distance: float) -> Relativ
         distance: metres along the reference.
 
     Raises:
-        ValueError: other shapes, or a distance that is not positive.
+        TorchCRFScanError: other shapes, or a distance that is not positive.
 
     Source: Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
     """

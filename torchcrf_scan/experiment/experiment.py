@@ -55,7 +55,7 @@ def run_experiment(config: RunConfig) -> dict[str, list[Table]]:
         The tables of every protocol; none on ranks of `torchrun` other than 0.
 
     Raises:
-        ValueError: nothing to leave out, a tested sequence that is trained on too, an unknown pair to draw, or a folder of
+        TorchCRFScanError: nothing to leave out, a tested sequence that is trained on too, an unknown pair to draw, or a folder of
             another experiment.
     """
     folder = Path(config.output)
@@ -92,7 +92,7 @@ def run_ablations(config: RunConfig, variants: Mapping[str, RunConfig]) -> list[
         One table; none on ranks other than 0.
 
     Raises:
-        ValueError: as `run_experiment`.
+        TorchCRFScanError: as `run_experiment`.
     """
     pairs, tested = load_pairs(config)
     refuse_leaks([config, *variants.values()], pairs, tested)
@@ -156,7 +156,7 @@ def load_pairs(config: RunConfig) -> tuple[list[ScanPair], int]:
 
 
 def refuse_leaks(configs: Sequence[RunConfig], pairs: Sequence[ScanPair], tested: int) -> None:
-    """Raises ValueError if a tested sequence is always trained on, or was for the initial weights of an encoder."""
+    """Raises TorchCRFScanError if a tested sequence is always trained on, or was for the initial weights of an encoder."""
     TrainedOn().plus(pairs[tested:]).refuse(pairs[:tested], "experiment.also_train")
     for init in sorted({config.init for config in configs if config.model.encoder.width > 0}):
         TrainedOn.of_model(init).refuse(pairs[:tested], f"init {init}")
@@ -170,7 +170,7 @@ def simulate(worlds: Sequence[str], config: RunConfig, seed: int) -> list[ScanPa
 
 
 def claim(folder: Path, config: RunConfig, pairs: Sequence[ScanPair]) -> None:
-    """Marks the folder as this experiment's; raises ValueError if its folds were made with other settings or pairs."""
+    """Marks the folder as this experiment's; raises TorchCRFScanError if its folds were made with other settings or pairs."""
     values = asdict(config)
     for name in ("output", "overfit", "compare_chains"):
         values.pop(name)
@@ -202,7 +202,7 @@ def differing(ours: Mapping[str, object], theirs: Mapping[str, object], prefix: 
 
 
 def find_pairs(wanted: Sequence[str], pairs: Sequence[ScanPair]) -> list[ScanPair]:
-    """The pairs named SEQUENCE:NUMBER (ValueError for an unknown one); by default the first of the first sequences."""
+    """The pairs named SEQUENCE:NUMBER (TorchCRFScanError for an unknown one); by default the first of the first sequences."""
     by_sequence: dict[str, list[ScanPair]] = {}
     for pair in pairs:
         by_sequence.setdefault(pair.sequence, []).append(pair)

@@ -50,7 +50,7 @@ class Judged:
 
     @classmethod
     def joined(cls, parts: Sequence[Judged]) -> Judged:
-        """Concatenates all parts. Raises ValueError for none."""
+        """Concatenates all parts. Raises TorchCRFScanError for none."""
         if not parts:
             raise TorchCRFScanError("parts: expected at least one, got none")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
@@ -94,7 +94,7 @@ def judge(pairs: Sequence[ScanPair], prediction: Prediction, counts: Sequence[bo
         counts: (B,) pairs to include; None: all.
 
     Raises:
-        ValueError: a pair without annotation.
+        TorchCRFScanError: a pair without annotation.
     """
     association, cluster = association_log_odds(prediction), cluster_log_odds(prediction)
     parts = [Judged.nothing()]
@@ -141,7 +141,7 @@ def fit_confidence(log_odds: ArrayLike, is_right: ArrayLike) -> Floats:
         log_odds: (P,). is_right: (P,) bool.
 
     Raises:
-        ValueError: empty input.
+        TorchCRFScanError: empty input.
     """
     values, right = np.asarray(log_odds, dtype=np.float64), np.asarray(is_right, dtype=bool)
     if not len(values) or values.shape != right.shape:
@@ -167,7 +167,7 @@ def fit_covariance_factor(nees: ArrayLike, quantile: float = FIT_QUANTILE, freed
         freedom: degrees of freedom of the chi-square.
 
     Raises:
-        ValueError: empty input.
+        TorchCRFScanError: empty input.
     """
     values = np.asarray(nees, dtype=np.float64)
     if not len(values):

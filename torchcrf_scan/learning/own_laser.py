@@ -94,7 +94,7 @@ def calibrate_on(
             of outliers and the confidences stay, about which the model cannot learn from its own labels.
 
     Raises:
-        ValueError: fewer than two pairs, one without annotation, or a model of one chain.
+        TorchCRFScanError: fewer than two pairs, one without annotation, or a model of one chain.
     """
     is_certain = len(pairs) > 0
     pairs, also = (pairs, also) if is_certain else (also, ())

@@ -51,7 +51,7 @@ def load(config: Config, ranks: Ranks) -> RunData:
     """The pairs of a run, the same in every process.
 
     Raises:
-        ValueError: none to learn from, a sequence both learned from and tested, or too few sequences to hold one out.
+        TorchCRFScanError: none to learn from, a sequence both learned from and tested, or too few sequences to hold one out.
     """
     trained_on = TrainedOn.of_model(config.init)  # fails early if there is no such model
     train, test = load_annotated(config.data)
@@ -103,7 +103,7 @@ def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], lis
     """Training and validation pairs, sequences whole; all for training without first-order training.
 
     Raises:
-        ValueError: too few sequences to hold one out.
+        TorchCRFScanError: too few sequences to hold one out.
     """
     if not config.has_steps or config.gradient.validation == 0:
         return pairs, []

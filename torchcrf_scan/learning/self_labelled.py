@@ -66,7 +66,7 @@ def label_recordings(model: JointScanCRF, paths: Iterable[str | Path], most: int
         seconds: between the scans of a pair, at least about so many.
 
     Raises:
-        ValueError: a file that is no recording, or damaged.
+        TorchCRFScanError: a file that is no recording, or damaged.
     """
     pairs: list[ScanPair] = []
     for path in paths:

@@ -48,7 +48,7 @@ def true_labels(pair: ScanPair) -> Labels | None:
 
 
 def predicted_labels(pair: ScanPair, name: str, prediction: PairPrediction, truth: Labels | None) -> Labels:
-    """The predicted labels, movers numbered as the true ones; raises ValueError, with the name, if they do not fit the pair."""
+    """The predicted labels, movers numbered as the true ones; raises TorchCRFScanError if they do not fit the pair."""
     labels = _labels(pair, name, prediction)
     return labels if truth is None else _renumber(labels, truth)
 
@@ -87,7 +87,7 @@ def judge(name: str, drawn: Labels, pair: ScanPair, guess: Labels, truth: Labels
 
 
 def all_answers(pair: ScanPair, predictions: Mapping[str, PairPrediction], before: Labels | None = None) -> list[Answer]:
-    """The methods' labels in their order, then the true ones; raises ValueError if there are none.
+    """The methods' labels in their order, then the true ones; raises TorchCRFScanError if there are none.
 
     before: true labels that the pair's are numbered after, see `carried_on`; None: numbers of the annotation.
     """

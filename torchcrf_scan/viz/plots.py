@@ -52,7 +52,7 @@ def plot_pair(pair: ScanPair, prediction: PairPrediction | None = None) -> Figur
     movers' velocities and the sensor's motion; the largest mover magnified. Rows and columns without content are left out.
 
     Raises:
-        ValueError: the prediction does not fit the pair.
+        TorchCRFScanError: the prediction does not fit the pair.
     """
     truth = true_labels(pair)
     guess = None if prediction is None else predicted_labels(pair, "prediction", prediction, truth)
@@ -83,7 +83,7 @@ def plot_associations(pair: ScanPair, predictions: Mapping[str, PairPrediction])
         predictions: method name -> its prediction of this pair.
 
     Raises:
-        ValueError: there is nothing to draw, or a prediction does not fit the pair.
+        TorchCRFScanError: there is nothing to draw, or a prediction does not fit the pair.
     """
     answers = all_answers(pair, predictions)
     scene = make_scene(pair, [answer.labels for answer in reversed(answers)])
@@ -105,7 +105,7 @@ def plot_clusters(pair: ScanPair, predictions: Mapping[str, PairPrediction]) -> 
         predictions: method name -> its prediction of this pair.
 
     Raises:
-        ValueError: there is nothing to draw, or a prediction does not fit the pair.
+        TorchCRFScanError: there is nothing to draw, or a prediction does not fit the pair.
     """
     answers = all_answers(pair, predictions)
     scene = make_scene(pair, [answer.labels for answer in reversed(answers)])
@@ -119,7 +119,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: float = 130.0
     """Writes a PNG atomically; creates missing folders.
 
     Raises:
-        ValueError: `path` does not end in .png.
+        TorchCRFScanError: `path` does not end in .png.
     """
     path = Path(path)
     if path.suffix.lower() != ".png":

@@ -58,7 +58,7 @@ def plot_association_sequence(pairs: Sequence[ScanPair], predictions: Mapping[st
         pairs: P annotated pairs, each beginning with the scan that ends the one before. predictions: method -> its P predictions.
 
     Raises:
-        ValueError: a pair without annotation, or a prediction that does not fit its pair.
+        TorchCRFScanError: a pair without annotation, or a prediction that does not fit its pair.
     """
     methods, zoom = _steps(pairs, predictions)
     scene = methods[0][0].scene

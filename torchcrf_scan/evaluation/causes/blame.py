@@ -103,7 +103,7 @@ def blame(pair: ScanPair, prediction: PairPrediction, trace: SearchTrace, score:
         prediction: the answer of the search that `trace` tells of. score: of this answer (`metrics.score_pair`).
 
     Raises:
-        ValueError: a pair without annotation.
+        TorchCRFScanError: a pair without annotation.
     """
     right, truth, beam = rightness(pair, prediction, NEAR), pair.annotation, pair.source.beam
     assert truth is not None
