@@ -106,6 +106,11 @@ def test_versions_are_noted(run: Path) -> None:
     assert {"python", "torch", "numpy", "scikit-learn", "scipy", "torchcrf-scan", "git"} <= set(versions())
 
 
+def test_versions_are_told_without_git(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert versions()["git"] == "unknown"
+
+
 @pytest.mark.parametrize("tag", ["joint/association", "joint/clustering", "matching/association", "clustering/clustering"])
 def test_every_step_of_the_fit_is_logged(events: EventAccumulator, tag: str) -> None:
     losses = [event.value for event in events.Scalars(f"objective/{tag}")]

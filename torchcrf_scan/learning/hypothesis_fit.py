@@ -121,7 +121,7 @@ def fit_logistic(features: Tensor, label: Tensor) -> HypothesisScore:
 
 
 def _view(pair: ScanPair, generator: torch.Generator) -> HypothesisView | None:
-    """The pair disturbed like real recordings; None if a scan is left without points."""
+    """The pair disturbed like real recordings; None if a scan is left with fewer than two points."""
     assert pair.annotation is not None
     whole = pair_of(ScanPairBatch.collate([pair]), 0)
     kept = _thin(len(pair.source), generator), _thin(len(pair.target), generator)
