@@ -128,6 +128,6 @@ class Store:
         return progress
 
     def write_progress(self, progress: Progress) -> None:
-        """Raises OSError if it could not be written."""
+        """Writes what was done here; raises OSError if it cannot."""
         self._aside.mkdir(exist_ok=True)
         write_whole(self._aside / "progress.json", json.dumps(asdict(progress)))

@@ -72,8 +72,7 @@ def load_annotated(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
         raise TorchCRFScanError("data.simulate_train: expected a world at least where data.train names no files, got none")
 
     def read(patterns: tuple[str, ...] | str, worlds: tuple[str, ...], seed: int) -> list[ScanPair]:
-        patterns = (patterns,) if isinstance(patterns, str) else patterns
-        pairs = list(PairFiles(*patterns)) if patterns else []
+        pairs = read_files(patterns)
         for k, world in enumerate(worlds):
             pairs += simulate_pairs(NAMED_WORLDS[world], config.pairs, config.sequences, seed + k)
         return pairs
@@ -82,6 +81,12 @@ def load_annotated(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
         read(config.train, config.simulate_train, config.seed),
         read(config.test, config.simulate_test, config.seed + TEST_SEED),
     )
+
+
+def read_files(patterns: tuple[str, ...] | str) -> list[ScanPair]:
+    """The pairs of files, folders or glob patterns; none without a pattern."""
+    patterns = (patterns,) if isinstance(patterns, str) else patterns
+    return list(PairFiles(*patterns)) if patterns else []
 
 
 def label_unlabelled(config: Config, annotated: Sequence[ScanPair]) -> list[ScanPair]:
