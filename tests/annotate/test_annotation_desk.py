@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from worked import case, cases
+from worked import a_change, case, cases
 
 from torchcrf_scan.annotate.desk import PAUSE, Desk
 from torchcrf_scan.annotate.document import assign, drag
@@ -18,10 +18,6 @@ from torchcrf_scan.data.pair_file import read_pair, write_pair
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 
 CASES = cases()
-
-
-def a_change(desk: Desk) -> None:
-    desk.change(assign(desk.document, np.arange(5), -1))
 
 
 def body(path: Path) -> list[int]:

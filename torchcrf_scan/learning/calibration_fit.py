@@ -15,6 +15,7 @@ from scipy.stats import chi2
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import MOTION_FREEDOM, background_nees, rightness
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.inference.uncertainty import WITHIN, Calibration, association_log_odds, cluster_log_odds
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.model import JointScanCRF
@@ -81,8 +82,8 @@ def calibrate(model: JointScanCRF, material: Sequence[Material]) -> None:
 
 def moving_share(pair: ScanPair) -> float:
     """Share of the returns with a known body that belong to movers; 0 without known bodies."""
-    assert pair.annotation is not None
-    body = pair.annotation.body[~pair.annotation.ignore]
+    truth = annotation_of(pair)
+    body = truth.body[~truth.ignore]
     return float((body > 0).sum() / max((body >= 0).sum(), 1))
 
 

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import rightness
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.inference.uncertainty import WITHIN
 from torchcrf_scan.learning.calibration_fit import Judged, fit_confidence, judge
@@ -125,11 +126,10 @@ def errors(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
     """(P, 3) wrong annotated points of every pair: by association or cluster, by outlier decision, movers' points called static."""
     found = []
     for pair, answer in zip(pairs, model.match_pairs(pairs), strict=True):
-        assert pair.annotation is not None
-        right, beam = rightness(pair, answer, WITHIN), pair.source.beam
-        is_confused = (pair.annotation.association[beam] < 0) != (answer.association[beam] < 0)
+        right, truth, beam = rightness(pair, answer, WITHIN), annotation_of(pair), pair.source.beam
+        is_confused = (truth.association[beam] < 0) != (answer.association[beam] < 0)
         is_wrong = ~(right.within & right.cluster)
-        is_lost = (pair.annotation.body[beam] > 0) & (answer.cluster[beam] <= 0)
+        is_lost = (truth.body[beam] > 0) & (answer.cluster[beam] <= 0)
         found.append([(right.known & mistake).sum() for mistake in (is_wrong, is_confused, is_lost)])
     return np.array(found, dtype=np.float64)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchcrf_scan.errors import TorchCRFScanError
-from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers
+from torchcrf_scan.evaluation.counterparts import annotation_of, beams_apart, match_movers
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 
 ASSOCIATION_TOLERANCE = 2  # beams; associations within this distance are drawn as right
@@ -79,8 +79,7 @@ def _renumber(labels: Labels, truth: Labels) -> Labels:
 
 def judge(name: str, drawn: Labels, pair: ScanPair, guess: Labels, truth: Labels) -> Answer:
     """The labels `drawn` with the mistakes of `guess`; unannotated points are never mistakes."""
-    assert pair.annotation is not None
-    known = ~pair.annotation.ignore
+    known = ~annotation_of(pair).ignore
     known &= pair.source.to_beams(np.ones(len(pair.source), dtype=bool), False)
     near = beams_apart(pair.target, guess.association, truth.association) <= ASSOCIATION_TOLERANCE
     return Answer(name, drawn, known & ~near, known & (guess.cluster != truth.cluster))
