@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,3 +81,12 @@ def assert_slopes(answers: Callable[..., tuple[Tensor, ...]], *inputs: Tensor, s
     slopes, ahead, behind = torch.func.jacrev(at)(point), torch.func.vmap(at)(point + steps), torch.func.vmap(at)(point - steps)
     for slope, after, before in zip(slopes, ahead, behind, strict=True):
         torch.testing.assert_close(slope.movedim(-1, 0), (after - before) / (2 * step), rtol=1e-3, atol=atol)
+
+
+def events_of(folder: Path) -> Any:
+    """All that was written for TensorBoard in a folder, an `EventAccumulator`."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder), size_guidance=dict.fromkeys(("scalars", "images", "tensors", "histograms"), 0))
+    events.Reload()
+    return events

@@ -9,7 +9,6 @@ are plain named tensors, as runtimes need them.
 
 from __future__ import annotations
 
-import copy
 from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from torch.overrides import TorchFunctionMode
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.inference.start import Start
-from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.model import JointScanCRF, with_config
 from torchcrf_scan.variants import sweep
 from torchcrf_scan.whole_file import whole_path
 
@@ -50,8 +49,7 @@ class UnrolledDecoder(nn.Module):
     def __init__(self, model: JointScanCRF, iterations: int | None = None, *, plain: bool = False) -> None:
         super().__init__()
         self.plain = plain
-        self.model = copy.copy(model)
-        self.model.config = unrolled_config(model.config, iterations)
+        self.model = with_config(model, unrolled_config(model.config, iterations))
 
     def forward(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -469,3 +470,10 @@ class ClusteringCRF(JointScanCRF):
 
     def __init__(self, config: ModelConfig | None = None) -> None:
         super().__init__(replace(config or ModelConfig(), chains="clustering", coupling="motions"))
+
+
+def with_config(model: JointScanCRF, config: ModelConfig) -> JointScanCRF:
+    """The same model, with the same weights, under another config."""
+    other = copy.copy(model)
+    other.config = config
+    return other

@@ -8,20 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from worked import case, cases
+from worked import a_change, case, cases
 
 from torchcrf_scan.annotate.desk import PAUSE, Desk
 from torchcrf_scan.annotate.document import assign, drag
-from torchcrf_scan.annotate.queue import confidence_of, neighbour, order
+from torchcrf_scan.annotate.queue import confidence_of, order
 from torchcrf_scan.annotate.store import Progress, Store
 from torchcrf_scan.data.pair_file import read_pair, write_pair
 from torchcrf_scan.scan import PairPrediction, Scan, ScanPair
 
 CASES = cases()
-
-
-def a_change(desk: Desk) -> None:
-    desk.change(assign(desk.document, np.arange(5), -1))
 
 
 def body(path: Path) -> list[int]:
@@ -55,7 +51,6 @@ def test_the_least_sure_comes_first_and_what_is_done_last(tmp_path: Path) -> Non
 def test_order_and_confidence_without_answers_or_points() -> None:
     assert order({}, []) == []
     assert order({"a": 0.5, "b": 0.5, "c": 0.1}, ["a", "gone"]) == ["c", "b", "a"]
-    assert neighbour(["a"], "a", -1) == "a"
     nothing = Scan.from_ranges([np.nan], [0.0])
     answer = PairPrediction(np.array([-1]), np.array([-1]), np.zeros((1, 3)), np.zeros(1), np.zeros(1), True)
     assert confidence_of(ScanPair(nothing, nothing), answer) == 1.0

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from forked import begin
-from worked import act, actions, cases, state_of
+from worked import a_change, act, actions, cases, state_of
 
 from torchcrf_scan.annotate.desk import Desk
-from torchcrf_scan.annotate.document import assign
 from torchcrf_scan.annotate.store import Store
 from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.pair_file import read_pair, write_pair
@@ -33,10 +32,6 @@ ODD = [
     "progress.json",
     ".annotate",
 ]
-
-
-def a_change(desk: Desk, label: int = -1) -> None:
-    desk.change(assign(desk.document, np.arange(5), label))
 
 
 def found(folder: Path) -> list[str]:

@@ -26,6 +26,10 @@ def cases() -> list[Case]:
     return [case(name, confidence) for name, confidence in zip(NAMES, (0.9, 0.2, 0.5), strict=True)]
 
 
+def a_change(desk: Desk, label: int = -1) -> None:
+    desk.change(assign(desk.document, np.arange(5), label))
+
+
 def actions(seed: int) -> Iterator[Action]:
     random = np.random.default_rng(seed)
     while True:

@@ -27,7 +27,7 @@ def test_equal_sizes_keep_their_order() -> None:
 
 def test_target_points_is_the_way_back() -> None:
     association = np.array([3, -1, 1, 0])
-    assert target_points(PAIR, as_background(PAIR, association, MOTIONS[0])).tolist() == association.tolist()
+    assert target_points(PAIR, as_background(PAIR, association, MOTIONS[0]).association).tolist() == association.tolist()
 
 
 def test_all_outliers_of_empty_scans() -> None:

@@ -10,6 +10,7 @@ from torchcrf_scan.baselines.oracle import ORACLES, match_all, with_right_hypoth
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.scan import Annotation, Scan
 
 Traced = list[tuple[ScanPair, SearchTrace]]
@@ -26,15 +27,10 @@ def traced(model: JointScanCRF) -> Traced:
     return [(pair, trace) for pair, (_, trace) in zip(pairs, model.trace_pairs(pairs), strict=True)]
 
 
-def truth_of(pair: ScanPair) -> Annotation:
-    assert pair.annotation is not None
-    return pair.annotation
-
-
 def test_true_motions_stay_as_they_are(model: JointScanCRF, traced: Traced) -> None:
     metric = model.config.inference.motion_metric
     for pair, trace in traced:
-        answer, truth = with_true_motions(model, pair, trace), truth_of(pair)
+        answer, truth = with_true_motions(model, pair, trace), annotation_of(pair)
         assert answer.motions[0] == pytest.approx(truth.motions[0], abs=1e-6)
         for motion in answer.motions[1:]:
             assert np.abs(truth.motions - motion).max(1).min() < 1e-5
@@ -49,7 +45,7 @@ def test_right_hypotheses_alone_become_movers(model: JointScanCRF, traced: Trace
 
 def test_a_search_that_begins_at_its_own_background_gives_its_own_answer(model: JointScanCRF, traced: Traced) -> None:
     for pair, trace in traced:
-        truth = truth_of(pair)
+        truth = annotation_of(pair)
         found = replace(truth, motions=np.concatenate([trace.background[None], truth.motions[1:]]))
         answer = with_true_background(model, replace(pair, annotation=found))
         assert (answer.cluster == model.match_pairs([pair])[0].cluster).all()
@@ -57,8 +53,8 @@ def test_a_search_that_begins_at_its_own_background_gives_its_own_answer(model: 
 
 def test_an_unknown_background_is_searched_for(model: JointScanCRF, traced: Traced) -> None:
     pair = traced[0][0]
-    motions = np.concatenate([np.full((1, 3), np.nan), truth_of(pair).motions[1:]])
-    unknown = replace(pair, annotation=replace(truth_of(pair), motions=motions))
+    motions = np.concatenate([np.full((1, 3), np.nan), annotation_of(pair).motions[1:]])
+    unknown = replace(pair, annotation=replace(annotation_of(pair), motions=motions))
     assert (with_true_background(model, unknown).cluster == model.match_pairs([pair])[0].cluster).all()
     assert np.isfinite(with_true_motions(model, unknown, traced[0][1]).motions).all()
 

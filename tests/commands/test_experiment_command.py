@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from command_line import fail, run
 from matplotlib.figure import Figure
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from support import events_of
 
 from torchcrf_scan.baselines.register import BASELINES, installed
 from torchcrf_scan.experiment import cross_validation, experiment
@@ -78,9 +78,7 @@ def test_figures_and_events_are_there(done: tuple[Path, str]) -> None:
     for protocol in PROTOCOLS:
         pictures = {path.name for path in (folder / "figures" / protocol).iterdir()}
         assert {f"{kind}_sim_s{s}_000.png" for kind in ("associations", "clusters") for s in (0, 1)} <= pictures
-    events = EventAccumulator(str(folder / "events"), size_guidance={"tensors": 0})
-    events.Reload()
-    tags = events.Tags()
+    tags = events_of(folder / "events").Tags()
     assert {f"{protocol}/associations/sim_s0_000" for protocol in PROTOCOLS} <= {*tags["images"]}
     assert {f"{protocol}/text_summary" for protocol in PROTOCOLS} <= {*tags["tensors"]}
 

@@ -12,13 +12,13 @@ from torchcrf_scan.config import EncoderConfig, FeatureConfig, ModelConfig
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.encoder.encoder import ScanEncoder, unroll
-from torchcrf_scan.experiment.methods import with_config
 from torchcrf_scan.export import UnrolledDecoder, decoder_inputs
 from torchcrf_scan.features.learned import ExtraLogUnary
 from torchcrf_scan.learning.checkpoint import load_weights
 from torchcrf_scan.learning.objectives import make_objective
 from torchcrf_scan.learning.portions import as_portion
 from torchcrf_scan.learning.settings import Config, GradientConfig, LearningConfig
+from torchcrf_scan.model import with_config
 from torchcrf_scan.scan import ScanPair
 
 SMALL = EncoderConfig(width=8, dilations=(1, 2))

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
 
 
@@ -31,19 +32,14 @@ def make_prediction(association: np.ndarray, cluster: np.ndarray, motions: np.nd
     return PairPrediction(association, cluster, motions, np.ones(len(association)), np.ones(len(cluster)), True)
 
 
-def truth_of(pair: ScanPair) -> Annotation:
-    assert pair.annotation is not None
-    return pair.annotation
-
-
 def perfect(pair: ScanPair) -> PairPrediction:
-    truth = truth_of(pair)
+    truth = annotation_of(pair)
     return make_prediction(truth.association, truth.cluster, truth.motions)
 
 
 def perturbed(pair: ScanPair, rng: np.random.Generator, flips: float = 0.2) -> PairPrediction:
     """The truth with shifted and lost associations, wrong clusters, other mover numbers and noise on the motions."""
-    truth, n, m = truth_of(pair), pair.source.n_beams, pair.target.n_beams
+    truth, n, m = annotation_of(pair), pair.source.n_beams, pair.target.n_beams
     shifted = np.clip(truth.association + rng.integers(-3, 4, n) * (rng.random(n) < 0.5), -1, m - 1)
     association = np.where(truth.association < 0, -1, shifted)
     association = np.where(rng.random(n) < flips / 2, rng.integers(-1, m, n), association)
@@ -55,7 +51,7 @@ def perturbed(pair: ScanPair, rng: np.random.Generator, flips: float = 0.2) -> P
 
 
 def no_movers(pair: ScanPair, rng: np.random.Generator) -> PairPrediction:
-    truth = truth_of(pair)
+    truth = annotation_of(pair)
     return make_prediction(truth.association, np.minimum(truth.cluster, 0), truth.motions[:1] + 0.02)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_causes import BIKE, CAR, GONE, MOTIONS, WALL, Street, labelled, make_street
+from made_causes import BIKE, CAR, GONE, MOTIONS, WALL, Street, labelled
 from made_pairs import PREDICTORS, make_pair, motion_rows_missing
 
 from torchcrf_scan import JointScanCRF, PairPrediction, ScanPair
@@ -30,11 +30,6 @@ from torchcrf_scan.evaluation.causes.movers import (
 )
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
 from torchcrf_scan.evaluation.metrics import score_pair
-
-
-@pytest.fixture
-def street() -> Street:
-    return make_street()
 
 
 def blamed(street: Street, answer: PairPrediction | None = None, trace: SearchTrace | None = None) -> Blame:

@@ -4,14 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_causes import MOTIONS, UNITS, Street, make_street
+from made_causes import MOTIONS, UNITS, Street
 
 from torchcrf_scan.evaluation.causes.movers import TOLERANCE_SHARE, TrueMover, gap
-
-
-@pytest.fixture
-def street() -> Street:
-    return make_street()
 
 
 def car_of(street: Street, units: np.ndarray = UNITS) -> TrueMover:

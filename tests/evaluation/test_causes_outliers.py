@@ -6,18 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_causes import CAR, GONE, MOTIONS, Street, labelled, make_street
+from made_causes import CAR, GONE, MOTIONS, Street, labelled
 from made_pairs import PREDICTORS, make_pair
 
 from torchcrf_scan.evaluation.calibration import rightness
 from torchcrf_scan.evaluation.causes.blame import wrong_points
 from torchcrf_scan.evaluation.causes.outliers import OutlierCase, best_gate, with_true_outliers
 from torchcrf_scan.evaluation.counterparts import clusters_beneath
-
-
-@pytest.fixture
-def street() -> Street:
-    return make_street()
 
 
 def test_an_outlier_lies_in_the_cluster_of_the_nearest_inlier(street: Street) -> None:

@@ -5,16 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_pairs import make_pair, make_prediction, make_small, perfect, perturbed, random_labels, truth_of
+from made_pairs import make_pair, make_prediction, perfect, perturbed, random_labels
 
-from torchcrf_scan.evaluation.counterparts import match_movers, relabel
+from torchcrf_scan.evaluation.counterparts import annotation_of, match_movers, relabel
 from torchcrf_scan.evaluation.metrics import edit_distance, score_pair
 from torchcrf_scan.scan import Scan, ScanPair
-
-
-@pytest.fixture
-def small() -> ScanPair:
-    return make_small()
 
 
 def longest_common_subsequence(one: list[int], other: list[int]) -> int:
@@ -80,7 +75,7 @@ def test_ignored_and_lost_beams_change_nothing() -> None:
     rng = np.random.default_rng(2)
     pair = make_pair(60, 50, 2, rng, drop=0.2)
     prediction = perturbed(pair, rng)
-    unseen = truth_of(pair).ignore | ~pair.source.to_beams(np.ones(len(pair.source), bool), False)
+    unseen = annotation_of(pair).ignore | ~pair.source.to_beams(np.ones(len(pair.source), bool), False)
     other = dataclasses.replace(
         prediction,
         association=np.where(unseen, 0, prediction.association),
@@ -110,7 +105,7 @@ def test_scores_do_not_depend_on_the_numbering_of_the_beams(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pair = make_pair(40, 50, 2, rng, drop=0.2)
     answer = perturbed(pair, rng)
-    truth, ways = truth_of(pair), (np.arange(40)[::-1], np.arange(50)[::-1])
+    truth, ways = annotation_of(pair), (np.arange(40)[::-1], np.arange(50)[::-1])
     there = np.append(ways[1], -1)
     scans = [renumbered(scan, order) for scan, order in zip((pair.source, pair.target), ways, strict=True)]
     labels = {key: getattr(truth, key)[ways[0]] for key in ("cluster", "body", "ignore")}

@@ -7,17 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_causes import BIKE, CAR, MOTIONS, WALL, Street, labelled, make_street
+from made_causes import BIKE, CAR, MOTIONS, WALL, Street, labelled
 from made_pairs import PREDICTORS, make_pair, make_prediction, perfect
 
 from torchcrf_scan import PairPrediction, ScanPair
 from torchcrf_scan.evaluation.scene_flow import KINDS, FlowErrors, bucket_normalised, end_point_errors, moving_shares
 from torchcrf_scan.scan import Annotation, Scan
-
-
-@pytest.fixture
-def street() -> Street:
-    return make_street()
 
 
 def flow_of(street: Street, answer: PairPrediction | None = None) -> FlowErrors:

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_pairs import PREDICTORS, all_outliers, make_pair, make_prediction, make_small, perfect, perturbed, random_labels, truth_of
+from made_pairs import PREDICTORS, all_outliers, make_pair, make_prediction, perfect, perturbed, random_labels
 
 from torchcrf_scan.data.pair_file import read_pair, write_pair
 from torchcrf_scan.evaluation.calibration import expected_calibration_error, rightness
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.evaluation.metrics import score_pair
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.scan import PairPrediction, ScanPair
@@ -34,11 +35,6 @@ ALWAYS_DEFINED = (
     "success",
     "answered",
 )
-
-
-@pytest.fixture
-def small() -> ScanPair:
-    return make_small()
 
 
 def run_scorer(pairs: Path, predictions: Path) -> dict[str, dict[str, float]]:
@@ -176,7 +172,7 @@ def test_empty_scans_have_figures(n: int, m: int) -> None:
 
 
 def test_undefined_precision_is_zero_or_skipped(small: ScanPair) -> None:
-    truth = truth_of(small)
+    truth = annotation_of(small)
     without = make_prediction(np.maximum(truth.association, 0), np.maximum(truth.cluster, 0), truth.motions)
     summary = summarise([score_pair(small, perfect(small)), score_pair(small, without)])
     assert summary["association_precision"] == 50
@@ -185,7 +181,7 @@ def test_undefined_precision_is_zero_or_skipped(small: ScanPair) -> None:
 
 
 def test_unknown_true_motions_are_skipped(small: ScanPair) -> None:
-    truth = dataclasses.replace(truth_of(small), motions=np.full((2, 3), np.nan))
+    truth = dataclasses.replace(annotation_of(small), motions=np.full((2, 3), np.nan))
     unknown = dataclasses.replace(small, annotation=truth)
     prediction = perfect(small)
     summary = summarise([score_pair(unknown, prediction), score_pair(small, prediction)])
@@ -204,7 +200,7 @@ def test_an_ego_motion_without_answer_is_no_success(small: ScanPair) -> None:
     [((0.017, 0.0, 0.0), 100, 0), ((0.008, 0.1, 0.1), 0, 100), ((2 * np.pi, 0.01, 0.01), 100, 100), ((0.0, 0.2, 0.0), 0, 0)],
 )
 def test_both_bounds_of_a_good_ego_motion(small: ScanPair, error: tuple[float, float, float], strict: float, loose: float) -> None:
-    prediction = dataclasses.replace(perfect(small), motions=truth_of(small).motions + error)
+    prediction = dataclasses.replace(perfect(small), motions=annotation_of(small).motions + error)
     summary = summarise([score_pair(small, prediction)])
     assert (summary["ego_success"], summary["ego_success_loose"]) == (strict, loose)
 
@@ -249,23 +245,23 @@ def test_a_sure_answer_errs_by_its_mistakes(small: ScanPair) -> None:
 
 def test_normalised_errors_by_hand(small: ScanPair) -> None:
     """Errors (0.01, 0.02, 0) under deviations of 0.01; then none, and no covariance."""
-    motions = truth_of(small).motions + np.array([0.01, 0.02, 0.0])
+    motions = annotation_of(small).motions + np.array([0.01, 0.02, 0.0])
     off = dataclasses.replace(perfect(small), motions=motions, covariances=np.tile(1e-4 * np.eye(3), (2, 1, 1)))
-    right = dataclasses.replace(off, motions=truth_of(small).motions)
+    right = dataclasses.replace(off, motions=annotation_of(small).motions)
     summary = summarise([score_pair(small, answer) for answer in (off, right, right, perfect(small))])
     assert summary["nees_pairs"] == 3
     assert summary["nees_mean"] == pytest.approx(5 / 3)
     assert summary["nees_covered"] == 100
     assert summary["nees_low"] == pytest.approx(2.70 / 3, abs=1e-3)  # chi2(9), tables
     assert summary["nees_high"] == pytest.approx(19.02 / 3, abs=1e-2)
-    far = dataclasses.replace(off, motions=truth_of(small).motions + 0.1)
+    far = dataclasses.replace(off, motions=annotation_of(small).motions + 0.1)
     assert summarise([score_pair(small, far), score_pair(small, right)])["nees_covered"] == 50
 
 
 def test_nothing_is_said_of_covariances_that_are_none(small: ScanPair) -> None:
     given = dataclasses.replace(perfect(small), covariances=np.tile(np.eye(3), (2, 1, 1)))
     assert score_pair(small, given).sureness.nees == 0
-    unknown = dataclasses.replace(small, annotation=dataclasses.replace(truth_of(small), motions=np.full((2, 3), np.nan)))
+    unknown = dataclasses.replace(small, annotation=dataclasses.replace(annotation_of(small), motions=np.full((2, 3), np.nan)))
     silent = dataclasses.replace(given, motions=np.full((2, 3), np.nan))
     flat = dataclasses.replace(given, covariances=np.zeros((2, 3, 3)))
     for pair, answer in ((small, perfect(small)), (unknown, given), (small, silent), (small, flat)):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchcrf_scan.evaluation.trajectory import pairs_over, relative_error, same_times
+from torchcrf_scan.evaluation.trajectory import pairs_over, relative_error
 from torchcrf_scan.geometry import se2
 
 
@@ -27,8 +27,7 @@ def test_a_scale_error_grows_with_the_distance() -> None:
     np.testing.assert_allclose(found[0].translation, 0.02)
     np.testing.assert_allclose(found[1].translation, 0.04)
     assert [len(of) for of in found] == [46, 42]
-    assert found[0].summary()["translation_rmse"] == pytest.approx(0.02)
-    assert found[0].summary()["rotation_median"] == 0
+    np.testing.assert_array_equal(found[0].rotation, 0)
 
 
 @given(st.floats(-3, 3), st.floats(-9, 9), st.integers(0, 99))
@@ -65,7 +64,6 @@ def test_no_path_has_no_pairs() -> None:
     for still in (np.zeros((0, 3)), np.zeros((1, 3)), np.zeros((9, 3))):
         found = relative_error(still, still, 1.0)
         assert len(found) == 0
-        assert np.isnan(found.summary()["translation_rmse"])
 
 
 def test_pairs_begin_everywhere_and_go_ahead() -> None:
@@ -73,13 +71,6 @@ def test_pairs_begin_everywhere_and_go_ahead() -> None:
     start, end = pairs_over(poses, 2.0)
     assert (end > start).all()
     assert len(np.unique(start)) == len(start)
-
-
-def test_times_that_are_the_same() -> None:
-    ours, theirs = same_times(np.array([0.0, 1.0, 2.0, 3.0]), np.array([2.004, 0.001, 1.2, 0.003]))
-    np.testing.assert_array_equal(ours, [0, 2])
-    np.testing.assert_array_equal(theirs, [1, 0])
-    assert all(len(of) == 0 for of in same_times(np.zeros(0), np.ones(2)))
 
 
 @pytest.mark.parametrize(

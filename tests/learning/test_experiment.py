@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from made_up import RIVAL, Recorder, guess, make_pairs, make_study
 from matplotlib.figure import Figure
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from support import events_of
 
 from torchcrf_scan.config import InferenceConfig, ModelConfig
 from torchcrf_scan.data.pair_file import write_pair
@@ -160,9 +160,7 @@ def test_a_run_leaves_tables_figures_and_events(
         pictures = {path.stem for path in (tmp_path / "run" / "figures" / protocol).iterdir()}
         drawn = {f"{kind}_pair {k}" for kind in ("associations", "clusters") for k in (0, 2, 3)}
         assert pictures == drawn | {"loss_pair 2", "loss_pair 3"}  # pairs where `joint` makes more mistakes than its rival
-    events = EventAccumulator(str(tmp_path / "run" / "events"), size_guidance={"images": 0, "tensors": 0})
-    events.Reload()
-    tags = events.Tags()
+    tags = events_of(tmp_path / "run" / "events").Tags()
     assert tags["scalars"] == []  # final numbers are text
     assert "leave_one_pair_out/clusters/pair 3" in tags["images"]
     assert {f"{protocol}/text_summary" for protocol in tables} <= {*tags["tensors"]}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from support import events_of
 from test_trainer import load_main
 
 from torchcrf_scan.commands.experiment import experiment
@@ -64,13 +64,10 @@ def test_the_run_folder_has_a_checkpoint_and_the_training_events(run: Path) -> N
     names = {path.name for path in run.iterdir()}
     assert {"config.yaml", "versions.json", "metrics.json", "model", "events", "training", "checkpoint.pt"} <= names
     assert not any(name.startswith(".") for name in names)
-    events = EventAccumulator(str(run / "training"))
-    events.Reload()
+    events = events_of(run / "training")
     assert [event.step for event in events.Scalars("loss/total")] == [1, 2]
     assert [event.step for event in events.Scalars("validation/total")] == [0, 1, 2]
-    staged = EventAccumulator(str(run / "events"), size_guidance={"tensors": 0})
-    staged.Reload()
-    (final,) = staged.Tensors("final/text_summary")  # the numbers of the test pairs, of which no curve is drawn
+    (final,) = events_of(run / "events").Tensors("final/text_summary")  # the numbers of the test pairs, of which no curve is drawn
     assert final.tensor_proto.string_val[0].decode().strip() == (run / "tables.md").read_text().strip()
     assert not any(tag.startswith("final/") for tag in events.Tags()["scalars"])
 

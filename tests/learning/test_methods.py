@@ -14,14 +14,14 @@ from scenes import make_batch, make_start
 from torchcrf_scan.baselines.register import BASELINES, Baseline, installed
 from torchcrf_scan.batch import Truth
 from torchcrf_scan.config import EncoderConfig
-from torchcrf_scan.experiment.methods import METHODS, Answer, answer, true_start, with_config, with_motions_given
+from torchcrf_scan.experiment.methods import METHODS, Answer, answer, true_start, with_motions_given
 from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT, LATTICE, LATTICE_EXACT, Models, fit_models
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.learning.calibration_fit import calibrate
 from torchcrf_scan.learning.settings import GradientConfig
-from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.model import JointScanCRF, with_config
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 ORACLES = ("joint, true motions", "joint, true associations")

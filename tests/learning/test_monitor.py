@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import small_run
 import torch
+from support import events_of
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
@@ -22,12 +23,6 @@ from torchcrf_scan.learning.trainer import flatten, settings_of
 from torchcrf_scan.learning.validation import BASELINE, RIVAL
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.names import LOCAL_CHANNELS
-
-
-def read(folder: Path) -> EventAccumulator:
-    events = EventAccumulator(str(folder / "training"), size_guidance={"tensors": 0, "images": 0, "scalars": 0, "histograms": 0})
-    events.Reload()
-    return events
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +41,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, drawn_once: None) -> Path:
 
 @pytest.fixture(scope="module")
 def events(run: Path) -> EventAccumulator:
-    return read(run)
+    return events_of(run / "training")
 
 
 def steps(events: EventAccumulator, tag: str) -> list[int]:
@@ -128,7 +123,7 @@ def test_a_run_that_goes_on_hides_what_it_does_again(tmp_path: Path) -> None:
         with TrainingMonitor(tmp_path, config, first_step) as monitor:
             for step, value in enumerate(values, first_step or 1):
                 monitor.writer.add_scalar("loss/total", value, step)
-    events = read(tmp_path).Scalars("loss/total")
+    events = events_of(tmp_path / "training").Scalars("loss/total")
     assert [(event.step, event.value) for event in events] == [(1, 1.0), (2, 2.0), (3, 30.0), (4, 40.0)]
 
 
@@ -137,7 +132,7 @@ def test_another_run_in_the_folder_hides_the_one_before(tmp_path: Path, event_fi
         with TrainingMonitor(tmp_path, small_run.small_config()) as monitor:
             for step, value in enumerate(values, 1):
                 monitor.writer.add_scalar("loss/total", value, step)
-    assert [event.value for event in read(tmp_path).Scalars("loss/total")] == [10.0, 20.0]
+    assert [event.value for event in events_of(tmp_path / "training").Scalars("loss/total")] == [10.0, 20.0]
 
 
 def test_a_full_disk_ends_the_watching_and_not_the_training(

@@ -11,7 +11,7 @@ from torchcrf_scan import JointScanCRF
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
 from torchcrf_scan.learning import own_laser
-from torchcrf_scan.learning.own_laser import Given, calibrate_on, folds_of, gains, moved_towards, named, surprise, wrong_points
+from torchcrf_scan.learning.own_laser import Given, calibrate_on, errors, folds_of, gains, moved_towards, named, surprise
 from torchcrf_scan.learning.settings import LearningConfig
 from torchcrf_scan.scan import OUTLIER, ScanPair
 
@@ -50,7 +50,7 @@ def test_the_annotation_s_convention_is_found_and_kept() -> None:
     assert list(by_name) == ["outlier distance", "scales", "movers' worth", "confidences"]
     assert by_name["outlier distance"].is_kept
     assert fitted.config.inference.outlier_distance == pytest.approx(GATE, rel=0.3)
-    assert wrong_points(fitted, annotated()).sum() < wrong_points(shipped(), annotated()).sum()
+    assert errors(fitted, annotated())[:, 0].sum() < errors(shipped(), annotated())[:, 0].sum()
 
 
 def test_what_is_kept_gains_and_the_model_given_is_unchanged() -> None:
@@ -70,7 +70,7 @@ def test_a_saved_calibration_is_used_by_default(tmp_path: object) -> None:
     fitted.save_pretrained(str(tmp_path))
     loaded = JointScanCRF.from_pretrained(str(tmp_path))
     assert loaded.config.inference.outlier_distance == fitted.config.inference.outlier_distance
-    np.testing.assert_array_equal(wrong_points(loaded, annotated()), wrong_points(fitted, annotated()))
+    np.testing.assert_array_equal(errors(loaded, annotated()), errors(fitted, annotated()))
 
 
 def test_folds_leave_every_pair_out_once() -> None:
@@ -107,7 +107,7 @@ def test_a_mover_s_worth_is_fitted_or_left(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_surprise_is_the_negative_log_likelihood() -> None:
-    judged = own_laser.Judged(np.array([2.0]), np.array([True]), np.array([True]), np.array([-1.0]), np.array([False]), np.zeros(0))
+    judged = own_laser.Judged(np.array([2.0]), np.array([True]), np.array([-1.0]), np.array([False]), np.zeros(0))
     expected = np.log1p(np.exp(-2.0)) + np.log1p(np.exp(-1.0))
     assert surprise(judged, np.array([[1.0, 0.0], [1.0, 0.0]])) == pytest.approx(expected)
 

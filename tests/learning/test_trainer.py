@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from support import events_of
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
@@ -48,9 +49,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, drawn_once: None) -> Path:
 
 @pytest.fixture(scope="module")
 def events(run: Path) -> EventAccumulator:
-    accumulator = EventAccumulator(str(run / "events"), size_guidance={"scalars": 0, "images": 0, "tensors": 0})
-    accumulator.Reload()
-    return accumulator
+    return events_of(run / "events")
 
 
 def test_the_run_folder_is_complete(run: Path) -> None:
@@ -107,6 +106,11 @@ def test_versions_are_noted(run: Path) -> None:
     assert {"python", "torch", "numpy", "scikit-learn", "scipy", "torchcrf-scan", "git"} <= set(versions())
 
 
+def test_versions_are_told_without_git(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert versions()["git"] == "unknown"
+
+
 @pytest.mark.parametrize("tag", ["joint/association", "joint/clustering", "matching/association", "clustering/clustering"])
 def test_every_step_of_the_fit_is_logged(events: EventAccumulator, tag: str) -> None:
     losses = [event.value for event in events.Scalars(f"objective/{tag}")]
@@ -129,8 +133,7 @@ def test_weights_of_every_step_are_logged(run: Path, events: EventAccumulator, c
 def test_the_fit_is_seen_to_learn(run: Path, events: EventAccumulator) -> None:
     """Curves of the accuracy from the first step to the fitted model, whose figures on the few test pairs are the final ones."""
     metrics = json.loads((run / "metrics.json").read_text())["joint"]
-    rival = EventAccumulator(str(run / "events" / "start + gated NN"), size_guidance={"scalars": 0})
-    rival.Reload()
+    rival = events_of(run / "events" / "start + gated NN")
     for name in WATCHED:
         curve = [event.value for event in events.Scalars(f"accuracy/{name}")]
         assert len(curve) >= 3

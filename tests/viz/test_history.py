@@ -25,7 +25,7 @@ def test_a_path_keeps_its_ends_and_even_steps(count: int, limit: int) -> None:
 def test_a_map_holds_the_mean_of_what_was_seen_at_least_twice() -> None:
     places = StaticMap()
     places.add(np.array([[1.0, 1.0], [1.002, 1.0], [5.0, 5.0]]), 5.0)
-    assert places.cell == 0.02
+    assert places._cell == 0.02
     np.testing.assert_allclose(places.points(), [[1.001, 1.0]])
     assert len(places.points(hits=1)) == 2
 
@@ -34,7 +34,7 @@ def test_a_map_that_is_full_becomes_coarser() -> None:
     places, rng = StaticMap(limit=500), np.random.default_rng(0)
     for _ in range(30):
         places.add(rng.uniform(-5, 5, (100, 2)), 5.0)
-    assert places.cell > 0.1
+    assert places._cell > 0.1
     assert 50 < len(places.points(hits=1)) <= 500
     assert np.abs(places.points()).max() <= 5
 

@@ -11,7 +11,7 @@ import numpy as np
 from torchcrf_scan.annotate.document import Document, annotated, annotation_of, blank, proposed
 from torchcrf_scan.annotate.fit import Scans
 from torchcrf_scan.annotate.history import History
-from torchcrf_scan.annotate.queue import confidence_of, neighbour, order
+from torchcrf_scan.annotate.queue import confidence_of, order
 from torchcrf_scan.annotate.store import Store
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.safe_names import one_line
@@ -40,7 +40,7 @@ class Desk:
         name: of the open pair. error: what could not be saved, one line, empty if nothing.
 
     Raises:
-        ValueError: the folder holds a pair of the same name with other scans.
+        TorchCRFScanError: the folder holds a pair of the same name with other scans.
     """
 
     def __init__(
@@ -96,7 +96,8 @@ class Desk:
     def go(self, step: int) -> None:
         """Opens a neighbour in the order of the pairs."""
         self._count()
-        self.name = neighbour(self.ring, self.name, step)
+        ring = self.ring
+        self.name = ring[(ring.index(self.name) + step) % len(ring)]
         self._open()
         self.save()
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchcrf_scan.annotate.fit import FOLLOWS, Scans, fit, search
+from torchcrf_scan.baselines.labels import target_points
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction
@@ -81,9 +82,7 @@ def annotated(scans: Scans, annotation: Annotation) -> Document:
     beam = scans.pair.source.beam
     body = np.where(annotation.cluster >= BACKGROUND, annotation.cluster, annotation.body)[beam]
     label = np.where(annotation.ignore[beam], UNKNOWN, body)
-    point_of_beam = np.full(scans.pair.target.n_beams + 1, OUTLIER)  # the last entry maps -1 to -1
-    point_of_beam[scans.pair.target.beam] = np.arange(len(scans.pair.target))
-    association = np.where(label >= BACKGROUND, point_of_beam[annotation.association[beam]], FOLLOWS)
+    association = np.where(label >= BACKGROUND, target_points(scans.pair, annotation.association), FOLLOWS)
     motions = np.array(annotation.motions, np.float64)
     motions[BACKGROUND] = np.where(np.isnan(motions[BACKGROUND]), blank(scans).motions[0], motions[BACKGROUND])
     document = replace(blank(scans), label=label, motions=motions, mended=association, held=np.zeros(len(motions), dtype=bool))
@@ -114,7 +113,7 @@ def assign(document: Document, points: Ints, label: int) -> Document:
     """Gives points to the background, an outlier's or unknown label, or to a mover; fits the motions that this concerns.
 
     Raises:
-        ValueError: a mover beyond the next free number.
+        TorchCRFScanError: a mover beyond the next free number.
     """
     if not UNKNOWN <= label <= min(len(document.motions), MOST_MOVERS):
         raise TorchCRFScanError(f"expected a mover up to {min(len(document.motions), MOST_MOVERS)}, got {label}")

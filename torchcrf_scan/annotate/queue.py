@@ -25,8 +25,3 @@ def order(confidences: Mapping[str, float], done: Sequence[str]) -> list[str]:
     """The names of pairs not done, by rising confidence, then those done, the last one last: a ring."""
     left = sorted((name for name in confidences if name not in done), key=lambda name: (confidences[name], name))
     return [*left, *(name for name in done if name in confidences)]
-
-
-def neighbour(ring: Sequence[str], name: str, step: int) -> str:
-    """The name so many places after another in a ring."""
-    return ring[(ring.index(name) + step) % len(ring)]

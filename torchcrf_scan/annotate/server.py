@@ -19,7 +19,6 @@ from torchcrf_scan.annotate.desk import Desk
 from torchcrf_scan.annotate.page import Page
 
 ADDRESS = "127.0.0.1"
-RESOURCES = "server"  # bokeh's own copy of its JavaScript, none from elsewhere
 
 
 class OwnRequests(Matcher):

@@ -62,7 +62,7 @@ class Store:
         """Keeps other processes away while the block runs; a killed one keeps nobody away.
 
         Raises:
-            ValueError: another process works here.
+            TorchCRFScanError: another process works here.
         """
         self._aside.mkdir(exist_ok=True)
         with alone(self._aside / "lock", wait=False) as is_alone:
@@ -86,7 +86,7 @@ class Store:
 
         Raises:
             OSError: the file could not be written, the old one stays.
-            ValueError: a pair that no file can hold.
+            TorchCRFScanError: a pair that no file can hold.
         """
         path = self.unfinished(name)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -128,6 +128,6 @@ class Store:
         return progress
 
     def write_progress(self, progress: Progress) -> None:
-        """Raises OSError if it could not be written."""
+        """Writes what was done here; raises OSError if it cannot."""
         self._aside.mkdir(exist_ok=True)
         write_whole(self._aside / "progress.json", json.dumps(asdict(progress)))

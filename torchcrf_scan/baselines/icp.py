@@ -80,7 +80,7 @@ def choose_gate(shares: Floats, gates: Sequence[float] = GATES) -> float:
     shares: (P, G) of `found_shares`; pairs of NaN are skipped. To be called with training pairs only.
 
     Raises:
-        ValueError: shares of another shape, or NaN for all pairs.
+        TorchCRFScanError: shares of another shape, or NaN for all pairs.
     """
     shares = np.asarray(shares, dtype=np.float64)
     if shares.ndim != 2 or shares.shape[1] != len(gates):

@@ -30,7 +30,7 @@ def cluster_displacements(
         clusters: K, maximum number of groups (at most the number of distinct displacements).
         remove_motion: measure displacements relative to the background's motion of `matched`.
     """
-    association = target_points(pair, matched)  # (N,)
+    association = target_points(pair, matched.association)  # (N,)
     inliers = np.flatnonzero(association >= 0)
     base = matched.motions[BACKGROUND]
     if not len(inliers):

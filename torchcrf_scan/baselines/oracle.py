@@ -5,7 +5,6 @@ They read the annotation and are no methods: their scores tell where errors come
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,14 +12,14 @@ import numpy as np
 import torch
 
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.causes.movers import TrueMover
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.inference.start import Start, beyond_reach, nearest_association
 from torchcrf_scan.loops.pair import pair_of
 from torchcrf_scan.loops.shape import resolution
-from torchcrf_scan.model import JointScanCRF
-from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, PairPrediction, ScanPair
+from torchcrf_scan.model import JointScanCRF, with_config
+from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, PairPrediction, ScanPair
 from torchcrf_scan.search.accept import score_of
 from torchcrf_scan.search.pairs import start_from, start_tensors
 from torchcrf_scan.search.survey import grids_of, survey_at
@@ -58,13 +57,6 @@ def with_true_motions(model: JointScanCRF, pair: ScanPair, trace: SearchTrace) -
     return _from(_at_given_motions(model), pair, np.stack(rows), members)
 
 
-def annotation_of(pair: ScanPair) -> Annotation:
-    """The annotation; raises ValueError for a pair without one."""
-    if pair.annotation is None:
-        raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
-    return pair.annotation
-
-
 def _movers(pair: ScanPair, trace: SearchTrace) -> dict[int, TrueMover]:
     """The true movers of known motion that have points, by number, the largest first."""
     truth, beam = annotation_of(pair), pair.source.beam
@@ -100,9 +92,7 @@ def _batch(model: JointScanCRF, pair: ScanPair) -> ScanPairBatch:
 
 def _at_given_motions(model: JointScanCRF) -> JointScanCRF:
     """The same model, with the same weights, that leaves the motions of its start as they are."""
-    given = copy.copy(model)
-    given.config = replace(model.config, inference=replace(model.config.inference, motion_metric="given"))
-    return given
+    return with_config(model, replace(model.config, inference=replace(model.config.inference, motion_metric="given")))
 
 
 ORACLES = {  # what is known: the answer of (model, pair, trace)

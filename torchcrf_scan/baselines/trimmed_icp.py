@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from torchcrf_scan.baselines.cloud import Cloud, fit_motion
-from torchcrf_scan.baselines.labels import all_outliers, as_background
+from torchcrf_scan.baselines.labels import as_background
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import OUTLIER, Floats, PairPrediction, ScanPair
 
@@ -24,13 +24,6 @@ TRUNCATION = 3.0  # units; larger residuals are clipped
 REACH = 0.12  # of the median range: unit of the grid's shifts
 TURNS = (0.0, 0.12, -0.12, 0.3, -0.3)  # radians
 SHIFTS = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (2.5, 0.0), (-2.5, 0.0))  # multiples of the reach
-
-
-def match_trimmed_icp(pair: ScanPair) -> PairPrediction:
-    """Background everywhere under the trimmed ICP's motion, nearest points inside the gate, outliers beyond."""
-    if not len(pair.source) or not len(pair.target):
-        return all_outliers(pair)
-    return match_under(pair, register_trimmed(Cloud.of(pair.source), Cloud.of(pair.target)))
 
 
 def match_under(pair: ScanPair, motion: Floats) -> PairPrediction:

@@ -34,7 +34,7 @@ def ask_fresh_process(model: str, backend: str, mode: str, pairs: Sequence[ScanP
         `first_call_ms`, of the first pair alone; `peak_mb`, peak memory in MB above that of the interpreter with torch loaded.
 
     Raises:
-        ValueError: the process fails.
+        TorchCRFScanError: the process fails.
     """
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / f"{k}.npz" for k in range(len(pairs))]

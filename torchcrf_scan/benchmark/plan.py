@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -10,7 +9,7 @@ from typing import Any
 
 from torchcrf_scan.benchmark.scenes import MODES, in_mode, street_pairs
 from torchcrf_scan.errors import TorchCRFScanError
-from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.model import JointScanCRF, with_config
 from torchcrf_scan.scan import ScanPair
 
 CENTRE = 361  # beams of the reference setting
@@ -90,7 +89,7 @@ def place_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def choose_backends(wanted: Sequence[str]) -> tuple[str, ...]:
-    """The backends wanted, by default all. Raises ValueError for an unknown one."""
+    """The backends wanted, by default all. Raises TorchCRFScanError for an unknown one."""
     for name in wanted:
         if name not in BACKENDS:
             raise TorchCRFScanError(f"--backends: expected some of {', '.join(BACKENDS)}, got {name}")
@@ -99,6 +98,4 @@ def choose_backends(wanted: Sequence[str]) -> tuple[str, ...]:
 
 def with_backend(model: JointScanCRF, backend: str) -> JointScanCRF:
     """The same model with one of `BACKENDS`."""
-    other = copy.copy(model)
-    other.config = replace(model.config, inference=replace(model.config.inference, backend=backend))
-    return other
+    return with_config(model, replace(model.config, inference=replace(model.config.inference, backend=backend)))

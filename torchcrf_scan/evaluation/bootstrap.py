@@ -72,7 +72,7 @@ def by_sequence(sequences: Sequence[str], resamples: int = 10_000, seed: int = 0
         (R, P) how often each pair is drawn.
 
     Raises:
-        ValueError: no pairs, or no resamples.
+        TorchCRFScanError: no pairs, or no resamples.
     """
     _check_positive(sequences=len(sequences), resamples=resamples)
     names, number = np.unique(np.asarray(sequences), return_inverse=True)
@@ -96,7 +96,7 @@ def by_blocks(sequences: Sequence[str], block: int = 5, resamples: int = 10_000,
         (R, P) how often each pair is drawn.
 
     Raises:
-        ValueError: no pairs, empty blocks, or no resamples.
+        TorchCRFScanError: no pairs, empty blocks, or no resamples.
     """
     _check_positive(sequences=len(sequences), block=block, resamples=resamples)
     generator = np.random.default_rng(seed)
@@ -116,7 +116,7 @@ def intervals(scores: Sequence[PairScore], weights: Ints) -> dict[str, Interval]
         scores: of P pairs. weights: (R, P) how often each pair is drawn, from `by_sequence` or `by_blocks`.
 
     Raises:
-        ValueError: weights of another shape.
+        TorchCRFScanError: weights of another shape.
     """
     once, resampled = _over_all(scores, weights)
     return {key: Interval(*numbers) for key, numbers in _spread(once, resampled, weights)}
@@ -129,7 +129,7 @@ def paired_intervals(ours: Sequence[PairScore], theirs: Sequence[PairScore], wei
         ours, theirs: scores of the same P pairs in the same order. weights: (R, P), as in `intervals`.
 
     Raises:
-        ValueError: no pairs, other pairs, or weights of another shape.
+        TorchCRFScanError: no pairs, other pairs, or weights of another shape.
     """
     _check_same_pairs(ours, theirs)
     (our, our_resampled), (their, their_resampled) = _over_all(ours, weights), _over_all(theirs, weights)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri  # quantiles of chi-square; `scipy.stats` takes a second to import
 
 from torchcrf_scan.errors import TorchCRFScanError
-from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers, relabel
+from torchcrf_scan.evaluation.counterparts import annotation_of, beams_apart, match_movers, relabel
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, Bools, Floats, PairPrediction, ScanPair
 
@@ -41,7 +41,7 @@ def reliability(confidence: ArrayLike, is_right: ArrayLike, bins: int = BINS) ->
         confidence: (P,) in [0, 1]. is_right: (P,) bool.
 
     Raises:
-        ValueError: other shapes, confidences outside [0, 1], no bins.
+        TorchCRFScanError: other shapes, confidences outside [0, 1], no bins.
     """
     confidences, right = np.asarray(confidence, dtype=np.float64), np.asarray(is_right, dtype=bool)
     if confidences.ndim != 1 or confidences.shape != right.shape:
@@ -101,7 +101,7 @@ class Consistency:
 
 
 def consistency(nees: ArrayLike, freedom: int = MOTION_FREEDOM, level: float = 0.95) -> Consistency:
-    """Compares normalised errors (P,) with the chi-square distribution. Raises ValueError for empty input."""
+    """Compares normalised errors (P,) with the chi-square distribution. Raises TorchCRFScanError for empty input."""
     values = np.asarray(nees, dtype=np.float64)
     if values.ndim != 1 or not len(values):
         raise TorchCRFScanError(f"nees: expected at least one number (P,), got {values.shape}")
@@ -123,28 +123,23 @@ class Rightness:
 
     Attributes:
         known: (N,) annotated returns; the others are not scored.
-        exact: (N,) the true target beam, or a true outlier.
         within: (N,) at most `tolerance` target beams off, or a true outlier.
         cluster: (N,) the true cluster, movers matched by overlap.
     """
 
     known: Bools
-    exact: Bools
     within: Bools
     cluster: Bools
 
 
 def rightness(pair: ScanPair, prediction: PairPrediction, tolerance: int = 2) -> Rightness:
-    """Compares a prediction with the pair's annotation. Raises ValueError for a pair without one."""
-    if pair.annotation is None:
-        raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
-    beam = pair.source.beam
-    known = ~pair.annotation.ignore[beam]
-    truth, answer = pair.annotation.association[beam], prediction.association[beam]
-    off = beams_apart(pair.target, truth, answer)
-    cluster, found = pair.annotation.cluster[beam], prediction.cluster[beam]
+    """Compares a prediction with the pair's annotation. Raises TorchCRFScanError for a pair without one."""
+    truth, beam = annotation_of(pair), pair.source.beam
+    known = ~truth.ignore[beam]
+    off = beams_apart(pair.target, truth.association[beam], prediction.association[beam])
+    cluster, found = truth.cluster[beam], prediction.cluster[beam]
     numbered = relabel(found, cluster, match_movers(cluster[known], found[known]))
-    return Rightness(known, off == 0, off <= tolerance, numbered == cluster)
+    return Rightness(known, off <= tolerance, numbered == cluster)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +160,7 @@ class Sureness:
 
     @classmethod
     def of(cls, pair: ScanPair, prediction: PairPrediction) -> Sureness:
-        """Compares a prediction with the pair's annotation. Raises ValueError for a pair without one."""
+        """Compares a prediction with the pair's annotation. Raises TorchCRFScanError for a pair without one."""
         right = rightness(pair, prediction)
         beam = pair.source.beam[right.known]
         return cls(

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from torchcrf_scan.evaluation.report import Cell, Table
+from torchcrf_scan.evaluation.measures import mean
+from torchcrf_scan.evaluation.table import Cell, Table
 from torchcrf_scan.scan import Floats
 
 TOLERANCE = 1e-3  # nats; smaller changes are none: potentials are float32
@@ -129,14 +130,10 @@ def _change(before: Floats, after: Floats) -> tuple[float, ...]:
         float(np.sum(change >= TOLERANCE)),
         float(len(falls)),
         100 * len(falls) / max(len(change), 1),
-        _mean(lengths),
+        mean(lengths),
         float(lengths.max(initial=0.0)),
-        _mean(finite),
+        mean(finite),
     )
-
-
-def _mean(values: Floats) -> float:
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def rounds_table(courses: Sequence[Course]) -> Table:
@@ -190,7 +187,7 @@ def best_table(courses: Sequence[Course]) -> Table:
         gain = np.array(gains)
         better, worse = gain[gain >= TOLERANCE], gain[gain <= -TOLERANCE]
         share = 100 / max(len(gain), 1)
-        rows.append((name, share * len(better), _mean(better), share * len(worse), _mean(worse), float(gain.max())))
+        rows.append((name, share * len(better), mean(better), share * len(worse), mean(worse), float(gain.max())))
     columns = ("by", "lattice better (% of pairs)", "by (mean)", "worse (%)", "by (mean)", "largest gain")
     return Table("The alternation against the lattice", columns, tuple(rows), (0, 1, 2, 1, 2, 2), BEST_NOTE)
 

@@ -6,7 +6,15 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints, PairPrediction, Scan, ScanPair
+from torchcrf_scan.errors import TorchCRFScanError
+from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Floats, Ints, PairPrediction, Scan, ScanPair
+
+
+def annotation_of(pair: ScanPair) -> Annotation:
+    """The annotation; raises TorchCRFScanError for a pair without one."""
+    if pair.annotation is None:
+        raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
+    return pair.annotation
 
 
 def match_movers(cluster: Ints, predicted: Ints) -> dict[int, int]:

@@ -33,7 +33,7 @@ def drive_scores(drives: Sequence[Drive], results: Sequence[Sequence[ScanResult]
         scale: of the drives' world (`SimulatorConfig.scale`), by which distances of places and paths are multiplied.
 
     Raises:
-        ValueError: no drives, or another number of results than of scans.
+        TorchCRFScanError: no drives, or another number of results than of scans.
     """
     if len(drives) != len(results) or any(len(a) != len(b) for a, b in zip(drives, results, strict=True)):
         raise TorchCRFScanError(f"results: expected one per scan of {len(drives)} drives, got others")

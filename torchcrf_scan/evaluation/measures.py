@@ -1,4 +1,4 @@
-"""Metrics that are ratios, numerator and denominator counted pair by pair: one function and one line each.
+"""Means, percentages, and metrics that are ratios, counted pair by pair: one function and one line each.
 
 A new metric needs only a line in `MEASURES`: `score_pair` counts it, `summarise` averages it, and its table shows it.
 """
@@ -9,10 +9,22 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from torchcrf_scan.scan import Bools, Floats, Ints, ScanPair
 
 Count = tuple[float, float]  # numerator and denominator
+
+
+def mean(values: ArrayLike) -> float:
+    """Mean of (P,) numbers; NaN of none."""
+    numbers = np.asarray(values, dtype=np.float64)
+    return float(numbers.mean()) if len(numbers) else float("nan")
+
+
+def percent(part: float, whole: float) -> float:
+    """Percentage; NaN of nothing."""
+    return 100 * part / whole if whole else float("nan")
 
 
 @dataclass(frozen=True, slots=True)

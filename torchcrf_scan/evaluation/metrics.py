@@ -14,7 +14,7 @@ from rapidfuzz.distance import Levenshtein
 
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import Sureness
-from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers, relabel
+from torchcrf_scan.evaluation.counterparts import annotation_of, beams_apart, match_movers, relabel
 from torchcrf_scan.evaluation.measures import EVERY, Count, Labelled
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
@@ -135,7 +135,7 @@ class PairScore:
 
 
 def score_pairs(pairs: Sequence[ScanPair], predictions: Sequence[PairPrediction]) -> list[PairScore]:
-    """Scores the predictions of annotated pairs; raises ValueError as `score_pair`, or for another number of them."""
+    """Scores the predictions of annotated pairs, as many as pairs; raises TorchCRFScanError as `score_pair`."""
     return [score_pair(pair, prediction) for pair, prediction in zip(pairs, predictions, strict=True)]
 
 
@@ -143,7 +143,7 @@ def score_pair(pair: ScanPair, prediction: PairPrediction) -> PairScore:
     """Scores the prediction of an annotated pair.
 
     Raises:
-        ValueError: a pair without annotation, or a prediction with another number of beams or with invalid target beams.
+        TorchCRFScanError: a pair without annotation, or a prediction with another number of beams or with invalid target beams.
     """
     truth = _checked_annotation(pair, prediction)
     keep = pair.source.beam[~truth.ignore[pair.source.beam]]  # counter-clockwise, whatever the beams' order
@@ -180,9 +180,7 @@ def edit_distance(labels: Ints, others: Ints, substitution: int) -> int:
 
 
 def _checked_annotation(pair: ScanPair, prediction: PairPrediction) -> Annotation:
-    n, m = pair.source.n_beams, pair.target.n_beams
-    if pair.annotation is None:
-        raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
+    truth, n, m = annotation_of(pair), pair.source.n_beams, pair.target.n_beams
     if prediction.association.shape != (n,) or prediction.cluster.shape != (n,):
         got = f"association {prediction.association.shape} and cluster {prediction.cluster.shape}"
         raise TorchCRFScanError(f"prediction of pair {pair.name!r}: expected labels of all ({n},) source beams, got {got}")
@@ -190,7 +188,7 @@ def _checked_annotation(pair: ScanPair, prediction: PairPrediction) -> Annotatio
         raise TorchCRFScanError(
             f"prediction of pair {pair.name!r}: expected association below {m}, got {prediction.association.max()}"
         )
-    return pair.annotation
+    return truth
 
 
 def _label_score(labels: Ints, predicted: Ints) -> LabelScore:

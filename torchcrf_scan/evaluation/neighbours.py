@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from torchcrf_scan.evaluation.calibration import Rightness, rightness
+from torchcrf_scan.evaluation.measures import mean
 from torchcrf_scan.evaluation.panoptic import PanopticCount, panoptic_quality
 from torchcrf_scan.evaluation.report import Column
 from torchcrf_scan.evaluation.scene_flow import FlowErrors, bucket_normalised, end_point_errors, moving_shares
@@ -63,7 +64,7 @@ class NeighbourScore:
 
     @classmethod
     def of(cls, pair: ScanPair, prediction: PairPrediction) -> NeighbourScore:
-        """The counts of an annotated pair; raises ValueError for a pair without annotation."""
+        """The counts of an annotated pair; raises TorchCRFScanError for a pair without annotation."""
         right: Rightness = rightness(pair, prediction)
         known = right.known
         flow, panoptic = FlowErrors.of(pair, prediction), PanopticCount.of(pair, prediction)
@@ -114,11 +115,11 @@ def errors_by_range(scores: Sequence[NeighbourScore]) -> dict[str, dict[str, flo
         moving = flown & flow.is_moving
         found[f"{low:.0f} to {high:.0f} m" if high < math.inf else f"from {low:.0f} m"] = {
             "points": float(own.sum()),
-            "association_wrong": 100 * _mean(association[own]),
-            "cluster_wrong": 100 * _mean(cluster[own]),
-            "epe_cm": 100 * _mean(flow.error[flown]),
-            "epe_moving_cm": 100 * _mean(flow.error[moving]),
-            "moving_found": 100 * _mean(flow.is_found_moving[moving]),
+            "association_wrong": 100 * mean(association[own]),
+            "cluster_wrong": 100 * mean(cluster[own]),
+            "epe_cm": 100 * mean(flow.error[flown]),
+            "epe_moving_cm": 100 * mean(flow.error[moving]),
+            "moving_found": 100 * mean(flow.is_found_moving[moving]),
         }
     return found
 
@@ -128,7 +129,3 @@ def _table(title: str, columns: Sequence[Column], summaries: Mapping[str, Mappin
     return Table(
         title, ("method", *(heading for heading, _, _ in columns)), tuple(rows), (0, *(digits for *_, digits in columns)), note
     )
-
-
-def _mean(values: Floats | Bools) -> float:
-    return float(values.mean()) if len(values) else float("nan")

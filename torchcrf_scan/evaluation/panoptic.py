@@ -20,7 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchcrf_scan.errors import TorchCRFScanError
+from torchcrf_scan.evaluation.counterparts import annotation_of
+from torchcrf_scan.evaluation.measures import percent
 from torchcrf_scan.evaluation.metrics import MOVER_MIN_POINTS
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Ints, PairPrediction, ScanPair
 
@@ -42,10 +43,8 @@ class PanopticCount:
 
     @classmethod
     def of(cls, pair: ScanPair, prediction: PairPrediction) -> PanopticCount:
-        """The movers of an annotated pair; raises ValueError for a pair without annotation."""
-        if pair.annotation is None:
-            raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
-        truth, beam = pair.annotation, pair.source.beam
+        """The movers of an annotated pair; raises TorchCRFScanError for a pair without annotation."""
+        truth, beam = annotation_of(pair), pair.source.beam
         cluster = truth.cluster[beam]
         return count_segments(cluster, prediction.cluster[beam], truth.ignore[beam] | (cluster == OUTLIER))
 
@@ -71,8 +70,4 @@ def panoptic_quality(counts: Sequence[PanopticCount]) -> dict[str, float]:
         sum(getattr(of, name) for of in counts) for name in ("overlap", "matched", "false", "missed")
     )
     half = matched + (false + missed) / 2
-    return {
-        "pq": 100 * overlap / half if half else float("nan"),
-        "sq": 100 * overlap / matched if matched else float("nan"),
-        "rq": 100 * matched / half if half else float("nan"),
-    }
+    return {"pq": percent(overlap, half), "sq": percent(overlap, matched), "rq": percent(matched, half)}

@@ -120,7 +120,7 @@ def overview_table(scores: Scores, *, seconds: Mapping[str, Sequence[float]] | N
     """One row per method with the main metrics, and the median of its `seconds`, the times of its pairs, if given.
 
     Raises:
-        ValueError: a method without scores.
+        TorchCRFScanError: a method without scores.
     """
     table = _table("Overview", OVERVIEW, scores)
     if seconds is None:
@@ -139,7 +139,7 @@ def paper_table(title: str, columns: Sequence[Column], scores: Scores, beside: p
         columns: the paper's. beside: its numbers, in the same columns. weights: (R, P) of `bootstrap.by_sequence` or `by_blocks`.
 
     Raises:
-        ValueError: a method without scores.
+        TorchCRFScanError: a method without scores.
     """
     table = _table(title, columns, scores, weights)
     if not any(method in beside.rows for method in scores):
@@ -160,7 +160,7 @@ def sequences_table(scores: Scores) -> Table:
     """The overview of every sequence apart.
 
     Raises:
-        ValueError: a method without scores.
+        TorchCRFScanError: a method without scores.
     """
     rows: list[tuple[Cell, ...]] = []
     for sequence in dict.fromkeys(one.sequence for of_method in scores.values() for one in of_method):
@@ -175,7 +175,7 @@ def sureness_table(scores: Scores) -> Table:
     """Calibration of confidences and consistency of covariances.
 
     Raises:
-        ValueError: a method without scores.
+        TorchCRFScanError: a method without scores.
     """
     return replace(_table("How sure", SURENESS, scores), note=SURENESS_NOTE)
 
@@ -192,7 +192,7 @@ def report(
         weights: (R, P) resamples of the pairs, for intervals in the Tables I to III; None: none.
 
     Raises:
-        ValueError: a method without scores.
+        TorchCRFScanError: a method without scores.
     """
     tables = [overview_table(scores, seconds=seconds)]
     for name, columns, more, numbers in (
@@ -214,7 +214,7 @@ def differences_table(reference: str, scores: Scores, weights: Ints) -> Table:
         weights: (R, P) resamples of the pairs, from `bootstrap.by_sequence` or `bootstrap.by_blocks`.
 
     Raises:
-        ValueError: an unknown `reference`, scores of other pairs, or weights of another shape.
+        TorchCRFScanError: an unknown `reference`, scores of other pairs, or weights of another shape.
     """
     if reference not in scores:
         raise TorchCRFScanError(f"reference: expected one of {', '.join(map(repr, scores))}, got {reference!r}")

@@ -26,8 +26,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchcrf_scan.errors import TorchCRFScanError
-from torchcrf_scan.evaluation.counterparts import clusters_beneath
+from torchcrf_scan.evaluation.counterparts import annotation_of, clusters_beneath
+from torchcrf_scan.evaluation.measures import mean, percent
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, Ints, PairPrediction, ScanPair
 
@@ -57,13 +57,11 @@ class FlowErrors:
 
     @classmethod
     def of(cls, pair: ScanPair, prediction: PairPrediction) -> FlowErrors:
-        """The errors of an annotated pair; raises ValueError for a pair without annotation.
+        """The errors of an annotated pair; raises TorchCRFScanError for a pair without annotation.
 
         A cluster without a finite answered motion moves with the answered background, and that, if it is unknown, not at all.
         """
-        if pair.annotation is None:
-            raise TorchCRFScanError(f"pair {pair.name!r}: expected an annotation, got none")
-        truth, beam, points = pair.annotation, pair.source.beam, pair.source.points
+        truth, beam, points = annotation_of(pair), pair.source.beam, pair.source.points
         body = np.where(truth.cluster[beam] != OUTLIER, truth.cluster[beam], truth.body[beam])
         is_finite = np.asarray(np.isfinite(truth.motions).all(axis=1))
         known = ~truth.ignore[beam] & (body >= BACKGROUND) & (body < len(is_finite)) & is_finite[BACKGROUND]
@@ -118,14 +116,14 @@ def end_point_errors(flow: FlowErrors) -> dict[str, float]:
     - `accuracy_strict`, `accuracy_relaxed`: points with an error below 5 cm or 5 % (10 cm or 10 %) of their way over the ground,
       and `_moving` of the moving ones alone.
     """
-    means = {f"epe_{name}": _mean(flow.error[flow.kind == k]) for k, name in enumerate(KINDS)}
+    means = {f"epe_{name}": mean(flow.error[flow.kind == k]) for k, name in enumerate(KINDS)}
     there = [value for value in means.values() if np.isfinite(value)]
     points = {f"points_{name}": float((flow.kind == k).sum()) for k, name in enumerate(KINDS)}
-    found = {**points, "epe": _mean(flow.error), **means, "epe_threeway": _mean(np.array(there)), "epe_kinds": float(len(there))}
+    found = {**points, "epe": mean(flow.error), **means, "epe_threeway": mean(np.array(there)), "epe_kinds": float(len(there))}
     for name, bound in (("strict", STRICT), ("relaxed", RELAXED)):
         is_near = (flow.error < bound) | (flow.error < bound * flow.way)
-        found[f"accuracy_{name}"] = 100 * _mean(is_near)
-        found[f"accuracy_{name}_moving"] = 100 * _mean(is_near[flow.is_moving])
+        found[f"accuracy_{name}"] = 100 * mean(is_near)
+        found[f"accuracy_{name}_moving"] = 100 * mean(is_near[flow.is_moving])
     return found
 
 
@@ -141,7 +139,7 @@ def bucket_normalised(flow: FlowErrors) -> dict[str, float]:
     full = np.unique(bucket[is_object & (bucket > 0)])
     of = [is_object & (bucket == k) for k in full]
     shares = np.array([flow.error[own].mean() / flow.way[own].mean() for own in of])
-    return {"bucket_static": _mean(flow.error[~is_object]), "bucket_dynamic": _mean(shares), "buckets": float(len(full))}
+    return {"bucket_static": mean(flow.error[~is_object]), "bucket_dynamic": mean(shares), "buckets": float(len(full))}
 
 
 def moving_shares(flow: FlowErrors) -> dict[str, float]:
@@ -152,16 +150,8 @@ def moving_shares(flow: FlowErrors) -> dict[str, float]:
     both = float((flow.is_moving & flow.is_found_moving).sum())
     true, found = float(flow.is_moving.sum()), float(flow.is_found_moving.sum())
     return {
-        "speed_iou": _percent(both, true + found - both),
-        "speed_precision": _percent(both, found),
-        "speed_recall": _percent(both, true),
-        "speed_f1": _percent(2 * both, true + found),
+        "speed_iou": percent(both, true + found - both),
+        "speed_precision": percent(both, found),
+        "speed_recall": percent(both, true),
+        "speed_f1": percent(2 * both, true + found),
     }
-
-
-def _percent(part: float, whole: float) -> float:
-    return 100 * part / whole if whole else float("nan")
-
-
-def _mean(values: Floats | Bools) -> float:
-    return float(values.mean()) if len(values) else float("nan")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import consistency, expected_calibration_error
-from torchcrf_scan.evaluation.measures import EVERY, Count
+from torchcrf_scan.evaluation.measures import EVERY, Count, mean
 from torchcrf_scan.evaluation.metrics import LabelScore, MotionError, ObjectScore, PairScore
 
 EGO_TRANSLATION, EGO_ROTATION = 0.05, 0.01745  # metres, radians (1 deg): success bounds of the ego motion
@@ -37,7 +37,7 @@ def summarise(scores: Sequence[PairScore]) -> dict[str, float]:
     `target_distance`, errors, `_ece` and `nees_` are NaN when there is nothing to average; no other key ever is.
 
     Raises:
-        ValueError: no scores.
+        TorchCRFScanError: no scores.
     """
     if not scores:
         raise TorchCRFScanError("scores: expected at least one pair, got none")
@@ -58,14 +58,8 @@ def _percent(part: float, whole: float) -> float:
     return 100.0 * part / whole if whole else 0.0
 
 
-def _mean(values: Iterable[float]) -> float:
-    """Mean, NaN for empty input."""
-    array = np.fromiter(values, dtype=np.float64)
-    return float(array.mean()) if len(array) else float("nan")
-
-
 def _mean_percent(counts: Sequence[Count]) -> float:
-    return _mean(_percent(part, whole) for part, whole in counts)
+    return mean([_percent(part, whole) for part, whole in counts])
 
 
 def _both_means(key: str, counts: Sequence[Count]) -> dict[str, float]:
@@ -76,8 +70,8 @@ def _both_means(key: str, counts: Sequence[Count]) -> dict[str, float]:
 def _label_summary(prefix: str, labels: Sequence[LabelScore]) -> dict[str, float]:
     return {
         f"{prefix}_accuracy": _mean_percent([(x.right, x.points) for x in labels]),
-        f"{prefix}_sed1": _mean(x.sed1 for x in labels),
-        f"{prefix}_sed2": _mean(x.sed2 for x in labels),
+        f"{prefix}_sed1": mean([x.sed1 for x in labels]),
+        f"{prefix}_sed2": mean([x.sed2 for x in labels]),
         f"{prefix}_outliers_found": _mean_percent([(x.outliers_predicted, x.points) for x in labels]),
         f"{prefix}_outliers_true": _mean_percent([(x.outliers_true, x.points) for x in labels]),
         **_both_means(f"{prefix}_recall", [(x.outliers_both, x.outliers_true) for x in labels]),
@@ -159,9 +153,9 @@ def _error_summary(prefix: str, objects: Sequence[ObjectScore], is_meant: Callab
     """Mean motion errors of the correctly clustered objects selected by `is_meant` (spec 8.5)."""
     errors = correct_errors([thing for thing in objects if is_meant(thing)])
     return {
-        f"{prefix}_rotation": _mean(error.rotation for error in errors),
-        f"{prefix}_translation": _mean(error.translation for error in errors),
-        f"{prefix}_centroid": _mean(error.centroid for error in errors),
+        f"{prefix}_rotation": mean([error.rotation for error in errors]),
+        f"{prefix}_translation": mean([error.translation for error in errors]),
+        f"{prefix}_centroid": mean([error.centroid for error in errors]),
         f"{prefix}_objects": float(len(errors)),
     }
 

@@ -25,7 +25,7 @@ class Table:
         note: explanation printed below the title.
 
     Raises:
-        ValueError: a row or `digits` of another length than `columns`.
+        TorchCRFScanError: a row or `digits` of another length than `columns`.
     """
 
     title: str

@@ -80,7 +80,7 @@ def track_scores(sequences: Sequence[Sequence[TrackFrame]]) -> dict[str, float]:
     - `objects`, `tracks`: true and estimated ones; `sightings`: of the true ones, by scan.
 
     Raises:
-        ValueError: no sequences.
+        TorchCRFScanError: no sequences.
         ImportError: trackeval is not installed.
     """
     from trackeval.metrics import CLEAR, HOTA, Identity

@@ -11,7 +11,6 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import Floats, Ints
 
 TOLERANCE = 0.1  # share of a distance by which the nearest pair of poses may miss it
-SAME_TIME = 0.01  # seconds between stamps that count as the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,52 +18,14 @@ class RelativeError:
     """Relative pose errors of P pairs of poses.
 
     Attributes:
-        distance: metres of the reference's path between the poses of each pair.
         translation: (P,) metres. rotation: (P,) radians.
     """
 
-    distance: float
     translation: Floats
     rotation: Floats
 
     def __len__(self) -> int:
         return len(self.translation)
-
-    def summary(self) -> dict[str, float]:
-        """`pairs`; root mean square and median of `translation` (metres) and `rotation` (radians); NaN without pairs."""
-        return {
-            "pairs": float(len(self)),
-            **_spread("translation", self.translation),
-            **_spread("rotation", self.rotation),
-        }
-
-
-def _spread(key: str, values: Floats) -> dict[str, float]:
-    is_empty = not len(values)
-    rmse, median = (np.nan, np.nan) if is_empty else (np.sqrt((values**2).mean()), np.median(values))
-    return {f"{key}_rmse": float(rmse), f"{key}_median": float(median)}
-
-
-def same_times(stamps: Floats, others: Floats, tolerance: float = SAME_TIME) -> tuple[Ints, Ints]:
-    """Indices (P,) into both of the stamps that are nearest to each other, within `tolerance` seconds, in the first's order.
-
-    stamps: (S,), others: (T,), seconds, in any order.
-    """
-    if not len(stamps) or not len(others):
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    there, back = _nearest(stamps, others), _nearest(others, stamps)
-    ours = np.arange(len(stamps))
-    kept = (back[there] == ours) & (np.abs(stamps - others[there]) <= tolerance)
-    return ours[kept], there[kept]
-
-
-def _nearest(stamps: Floats, others: Floats) -> Ints:
-    """(S,) index of the nearest of `others` (T,), T > 0, to every stamp; the earlier one of two as near."""
-    order = np.argsort(others, kind="stable")
-    after = np.clip(np.searchsorted(others[order], stamps), 0, len(others) - 1)
-    before = np.maximum(after - 1, 0)
-    is_before = np.abs(others[order[before]] - stamps) <= np.abs(others[order[after]] - stamps)
-    return np.where(is_before, order[before], order[after])
 
 
 def pairs_over(poses: Floats, distance: float) -> tuple[Ints, Ints]:
@@ -89,11 +50,11 @@ def relative_error(poses: Floats, reference: Floats, distance: float) -> Relativ
     The same as `evo_rpe --delta D --delta_unit m --all_pairs --pairs_from_reference`.
 
     Args:
-        poses: (S, 3) estimated. reference: (S, 3) true, at the same times (`same_times`). Each in a frame of its own.
+        poses: (S, 3) estimated. reference: (S, 3) true, at the same times. Each in a frame of its own.
         distance: metres along the reference.
 
     Raises:
-        ValueError: other shapes, or a distance that is not positive.
+        TorchCRFScanError: other shapes, or a distance that is not positive.
 
     Source: Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
     """
@@ -102,8 +63,8 @@ def relative_error(poses: Floats, reference: Floats, distance: float) -> Relativ
     if not distance > 0:
         raise TorchCRFScanError(f"distance: expected metres above 0, got {distance}")
     if not len(poses):
-        return RelativeError(distance, np.zeros(0), np.zeros(0))
+        return RelativeError(np.zeros(0), np.zeros(0))
     start, end = pairs_over(reference, distance)
     moved, should = (se2.compose(se2.inverse(of[start]), of[end]) for of in (poses, reference))
     error = se2.compose(se2.inverse(should), moved)
-    return RelativeError(distance, np.hypot(error[:, 1], error[:, 2]), np.abs(error[:, 0]))
+    return RelativeError(np.hypot(error[:, 1], error[:, 2]), np.abs(error[:, 0]))

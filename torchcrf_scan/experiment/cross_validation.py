@@ -53,7 +53,7 @@ def make_folds(protocol: str, pairs: Sequence[ScanPair], tested: int, every: int
         every: only every so-many-th of the tested pairs is tested.
 
     Raises:
-        ValueError: fewer than two things to leave out, or two of the same name.
+        TorchCRFScanError: fewer than two things to leave out, or two of the same name.
     """
     by_pair = protocol == "leave_one_pair_out"
     groups: dict[str, list[int]] = {}

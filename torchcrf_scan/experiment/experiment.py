@@ -13,7 +13,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from torchcrf_scan.baselines.register import BASELINES, installed
-from torchcrf_scan.data.dataset import PairFiles
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import NAMED_WORLDS
 from torchcrf_scan.errors import TorchCRFScanError
@@ -27,6 +26,7 @@ from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT
 from torchcrf_scan.experiment.settings import RunConfig
 from torchcrf_scan.experiment.study import Study
 from torchcrf_scan.learning.leaks import TrainedOn
+from torchcrf_scan.learning.run_data import read_files
 from torchcrf_scan.learning.run_log import RunLog, one_error
 from torchcrf_scan.safe_names import file_name, slug
 from torchcrf_scan.scan import Ints, PairPrediction, ScanPair
@@ -55,7 +55,7 @@ def run_experiment(config: RunConfig) -> dict[str, list[Table]]:
         The tables of every protocol; none on ranks of `torchrun` other than 0.
 
     Raises:
-        ValueError: nothing to leave out, a tested sequence that is trained on too, an unknown pair to draw, or a folder of
+        TorchCRFScanError: nothing to leave out, a tested sequence that is trained on too, an unknown pair to draw, or a folder of
             another experiment.
     """
     folder = Path(config.output)
@@ -92,16 +92,16 @@ def run_ablations(config: RunConfig, variants: Mapping[str, RunConfig]) -> list[
         One table; none on ranks other than 0.
 
     Raises:
-        ValueError: as `run_experiment`.
+        TorchCRFScanError: as `run_experiment`.
     """
     pairs, tested = load_pairs(config)
     refuse_leaks([config, *variants.values()], pairs, tested)
     scores, seconds = {}, {}
     with TemporaryDirectory() as kept:
-        looks = Looks(pairs, Path(kept))
+        studies = Studies(pairs, Path(kept))
         for name, variant in {"as configured": config, **variants}.items():
             log.info("%s", name)
-            found = run_variant(config, ablated(config, variant, name), looks, tested)
+            found = run_variant(config, ablated(config, variant, name), studies, tested)
             if found is not None:
                 scores[name], seconds[name] = score(found)[JOINT], found.seconds[JOINT]
     if rank_and_world()[0] != 0:
@@ -112,19 +112,19 @@ def run_ablations(config: RunConfig, variants: Mapping[str, RunConfig]) -> list[
 
 
 @dataclass(frozen=True, slots=True)
-class Looks:
-    """Cache of studies of the same pairs, made on demand. kept: folder of results shared by variants."""
+class Studies:
+    """The studies of the same pairs, made on demand. kept: folder of results shared by variants."""
 
     pairs: Sequence[ScanPair]
     kept: Path
-    studies: dict[str, Study] = field(default_factory=dict)
+    made: dict[str, Study] = field(default_factory=dict)
 
     def study(self, config: RunConfig, jobs: int) -> Study:
         """The study of a variant, shared by variants with the same preprocessing."""
-        looked_at = json.dumps([config.learning.seed, config.learning.disturbance])
-        if looked_at not in self.studies:
-            self.studies[looked_at] = replace(Study.of(self.pairs, config, jobs), kept=self.kept)
-        return self.studies[looked_at]
+        key = json.dumps([config.learning.seed, config.learning.disturbance])
+        if key not in self.made:
+            self.made[key] = replace(Study.of(self.pairs, config, jobs), kept=self.kept)
+        return self.made[key]
 
 
 def ablated(config: RunConfig, variant: RunConfig, name: str) -> RunConfig:
@@ -134,21 +134,20 @@ def ablated(config: RunConfig, variant: RunConfig, name: str) -> RunConfig:
     return replace(variant, experiment=experiment, output=str(Path(config.output) / "ablations" / file_name(name)))
 
 
-def run_variant(config: RunConfig, variant: RunConfig, looks: Looks, tested: int) -> Results | None:
+def run_variant(config: RunConfig, variant: RunConfig, studies: Studies, tested: int) -> Results | None:
     """Runs the folds of one variant; None on ranks other than 0."""
-    pairs, folder = looks.pairs, Path(variant.output)
+    pairs, folder = studies.pairs, Path(variant.output)
     folds = make_folds(ABLATED, pairs, tested, variant.experiment.test_every)
     claim(folder, variant, pairs)
     jobs = cores(config.experiment.jobs)
-    run_folds(lambda jobs: looks.study(variant, jobs), {ABLATED: folds}, variant, folder / "folds", jobs)
+    run_folds(lambda jobs: studies.study(variant, jobs), {ABLATED: folds}, variant, folder / "folds", jobs)
     return read_folds(folder / "folds" / ABLATED, pairs, folds) if rank_and_world()[0] == 0 else None
 
 
 def load_pairs(config: RunConfig) -> tuple[list[ScanPair], int]:
     """The annotated pairs, the tested ones first, and the number of tested ones."""
     experiment, data = config.experiment, config.data
-    patterns = (experiment.pairs,) if isinstance(experiment.pairs, str) else experiment.pairs
-    tested = list(PairFiles(*patterns)) if patterns else simulate(experiment.worlds, config, data.seed)
+    tested = read_files(experiment.pairs) or simulate(experiment.worlds, config, data.seed)
     bare = [pair.name for pair in tested if pair.annotation is None]
     if bare or not tested:
         raise TorchCRFScanError(f"experiment.pairs: expected annotated pairs, got {bare[:3] or 'none'}")
@@ -156,7 +155,7 @@ def load_pairs(config: RunConfig) -> tuple[list[ScanPair], int]:
 
 
 def refuse_leaks(configs: Sequence[RunConfig], pairs: Sequence[ScanPair], tested: int) -> None:
-    """Raises ValueError if a tested sequence is always trained on, or was for the initial weights of an encoder."""
+    """Raises TorchCRFScanError if a tested sequence is always trained on, or was for the initial weights of an encoder."""
     TrainedOn().plus(pairs[tested:]).refuse(pairs[:tested], "experiment.also_train")
     for init in sorted({config.init for config in configs if config.model.encoder.width > 0}):
         TrainedOn.of_model(init).refuse(pairs[:tested], f"init {init}")
@@ -170,7 +169,7 @@ def simulate(worlds: Sequence[str], config: RunConfig, seed: int) -> list[ScanPa
 
 
 def claim(folder: Path, config: RunConfig, pairs: Sequence[ScanPair]) -> None:
-    """Marks the folder as this experiment's; raises ValueError if its folds were made with other settings or pairs."""
+    """Marks the folder as this experiment's; raises TorchCRFScanError if its folds were made with other settings or pairs."""
     values = asdict(config)
     for name in ("output", "overfit", "compare_chains"):
         values.pop(name)
@@ -202,7 +201,7 @@ def differing(ours: Mapping[str, object], theirs: Mapping[str, object], prefix: 
 
 
 def find_pairs(wanted: Sequence[str], pairs: Sequence[ScanPair]) -> list[ScanPair]:
-    """The pairs named SEQUENCE:NUMBER (ValueError for an unknown one); by default the first of the first sequences."""
+    """The pairs named SEQUENCE:NUMBER (TorchCRFScanError for an unknown one); by default the first of the first sequences."""
     by_sequence: dict[str, list[ScanPair]] = {}
     for pair in pairs:
         by_sequence.setdefault(pair.sequence, []).append(pair)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,12 +11,11 @@ import torch
 
 from torchcrf_scan.baselines.register import BASELINES, Case, installed
 from torchcrf_scan.batch import ScanPairBatch
-from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.experiment.models import ENCODED, EXACT, JOINT, LATTICE, LATTICE_EXACT, Models
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.inference.start import Start, nearest_association
 from torchcrf_scan.learning.plugins import reach_of_truth
-from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.model import JointScanCRF, with_config
 from torchcrf_scan.scan import PairPrediction, ScanPair
 
 HELD_ROUNDS = 10  # of the model with given motions
@@ -86,13 +84,6 @@ def timed(run: Callable[[], Result]) -> tuple[Result, float]:
     began = time.perf_counter()
     result = run()
     return result, time.perf_counter() - began
-
-
-def with_config(model: JointScanCRF, config: ModelConfig) -> JointScanCRF:
-    """The same weights under another config."""
-    other = copy.copy(model)
-    other.config = config
-    return other
 
 
 def with_motions_given(model: JointScanCRF) -> JointScanCRF:

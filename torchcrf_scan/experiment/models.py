@@ -82,7 +82,7 @@ def fit_encoded(joint: JointScanCRF, pairs: Sequence[ScanPair], material: Sequen
     """A model with an encoder, trained by first-order steps on the pairs and fresh ones, from `config.init` or the joint model.
 
     Raises:
-        ValueError: the config has no first-order objective.
+        TorchCRFScanError: the config has no first-order objective.
     """
     if not config.has_steps:
         raise TorchCRFScanError("gradient.objective: expected one for a model with an encoder, got none")

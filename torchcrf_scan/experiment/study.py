@@ -39,7 +39,7 @@ class Study:
 
     @classmethod
     def of(cls, pairs: Sequence[ScanPair], config: RunConfig, jobs: int) -> Study:
-        """Surveys the pairs on `jobs` cores. Raises ValueError for pairs without annotation."""
+        """Surveys the pairs on `jobs` cores. Raises TorchCRFScanError for pairs without annotation."""
         collection = collect(pairs, config.learning, jobs)
         if config.experiment.joint_alone:
             return cls(tuple(pairs), collection, np.zeros((len(pairs), len(GATES))))

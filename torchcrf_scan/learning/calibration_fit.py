@@ -15,6 +15,7 @@ from scipy.stats import chi2
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import MOTION_FREEDOM, background_nees, rightness
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.inference.uncertainty import WITHIN, Calibration, association_log_odds, cluster_log_odds
 from torchcrf_scan.learning.material import Material
 from torchcrf_scan.model import JointScanCRF
@@ -32,13 +33,12 @@ class Judged:
 
     Attributes:
         association_log_odds, cluster_log_odds: (P,).
-        association_right, association_exact, cluster_right: (P,) bool; right is within `WITHIN` target beams.
+        association_right, cluster_right: (P,) bool; an association is right within `WITHIN` target beams.
         nees: (Q,) normalised estimation errors squared of the background's motion.
     """
 
     association_log_odds: Floats
     association_right: Bools
-    association_exact: Bools
     cluster_log_odds: Floats
     cluster_right: Bools
     nees: Floats
@@ -47,11 +47,11 @@ class Judged:
     def nothing(cls) -> Judged:
         """An instance without returns and pairs."""
         number, flag = np.zeros(0), np.zeros(0, dtype=bool)
-        return cls(number, flag, flag, number, flag, number)
+        return cls(number, flag, number, flag, number)
 
     @classmethod
     def joined(cls, parts: Sequence[Judged]) -> Judged:
-        """Concatenates all parts. Raises ValueError for none."""
+        """Concatenates all parts. Raises TorchCRFScanError for none."""
         if not parts:
             raise TorchCRFScanError("parts: expected at least one, got none")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
@@ -82,8 +82,8 @@ def calibrate(model: JointScanCRF, material: Sequence[Material]) -> None:
 
 def moving_share(pair: ScanPair) -> float:
     """Share of the returns with a known body that belong to movers; 0 without known bodies."""
-    assert pair.annotation is not None
-    body = pair.annotation.body[~pair.annotation.ignore]
+    truth = annotation_of(pair)
+    body = truth.body[~truth.ignore]
     return float((body > 0).sum() / max((body >= 0).sum(), 1))
 
 
@@ -95,7 +95,7 @@ def judge(pairs: Sequence[ScanPair], prediction: Prediction, counts: Sequence[bo
         counts: (B,) pairs to include; None: all.
 
     Raises:
-        ValueError: a pair without annotation.
+        TorchCRFScanError: a pair without annotation.
     """
     association, cluster = association_log_odds(prediction), cluster_log_odds(prediction)
     parts = [Judged.nothing()]
@@ -109,7 +109,6 @@ def judge(pairs: Sequence[ScanPair], prediction: Prediction, counts: Sequence[bo
             Judged(
                 association_log_odds=association[b, :n].double().cpu().numpy()[known],
                 association_right=right.within[known],
-                association_exact=right.exact[known],
                 cluster_log_odds=cluster[b, :n].double().cpu().numpy()[known],
                 cluster_right=right.cluster[known],
                 nees=nees[np.isfinite(nees)],
@@ -143,7 +142,7 @@ def fit_confidence(log_odds: ArrayLike, is_right: ArrayLike) -> Floats:
         log_odds: (P,). is_right: (P,) bool.
 
     Raises:
-        ValueError: empty input.
+        TorchCRFScanError: empty input.
     """
     values, right = np.asarray(log_odds, dtype=np.float64), np.asarray(is_right, dtype=bool)
     if not len(values) or values.shape != right.shape:
@@ -169,7 +168,7 @@ def fit_covariance_factor(nees: ArrayLike, quantile: float = FIT_QUANTILE, freed
         freedom: degrees of freedom of the chi-square.
 
     Raises:
-        ValueError: empty input.
+        TorchCRFScanError: empty input.
     """
     values = np.asarray(nees, dtype=np.float64)
     if not len(values):

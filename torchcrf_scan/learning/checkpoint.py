@@ -58,7 +58,7 @@ class Store:
         """The last valid checkpoint, or None.
 
         Raises:
-            ValueError: a checkpoint with other settings, which are listed, or an invalid file.
+            TorchCRFScanError: a checkpoint with other settings, which are listed, or an invalid file.
         """
         for left in self.folder.glob(f".{NAME}.*"):  # of a process that was killed while writing
             left.unlink()
@@ -85,7 +85,7 @@ def load_weights(model: JointScanCRF, origin: str | JointScanCRF) -> None:
     """Loads the weights of a model, or of a saved one by its folder or name; parts missing there are unchanged.
 
     Raises:
-        ValueError: no such model, or one of other features.
+        TorchCRFScanError: no such model, or one of other features.
     """
     saved = (origin if isinstance(origin, JointScanCRF) else JointScanCRF.from_pretrained(origin)).state_dict()
     fresh = model.optional_state | {name: value for name, value in model.state_dict().items() if name.startswith("encoder.")}

@@ -181,7 +181,7 @@ def has_amp(config: GradientConfig, device: torch.device) -> bool:
 
 
 def refuse_remainder(gradient: GradientConfig, ranks: Ranks) -> None:
-    """Raises ValueError where the parts of a step cannot be divided evenly among the processes."""
+    """Raises TorchCRFScanError where the parts of a step cannot be divided evenly among the processes."""
     if gradient.batch_size // gradient.part % ranks.world:
         parts = f"{gradient.batch_size} / {gradient.part}"
         raise TorchCRFScanError(
@@ -216,7 +216,7 @@ def train_by_gradient(
         store: written by the first process. state: a checkpoint to resume, the same in every process.
 
     Raises:
-        ValueError: the parts of a step cannot be divided evenly among the processes.
+        TorchCRFScanError: the parts of a step cannot be divided evenly among the processes.
     """
     gradient = config.gradient
     refuse_remainder(gradient, ranks)

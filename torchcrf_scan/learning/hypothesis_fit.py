@@ -13,6 +13,7 @@ from torch import Tensor
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.learning.disturb import bump, skew
 from torchcrf_scan.loops.pair import Pair, array_of, pair_of
@@ -121,8 +122,8 @@ def fit_logistic(features: Tensor, label: Tensor) -> HypothesisScore:
 
 
 def _view(pair: ScanPair, generator: torch.Generator) -> HypothesisView | None:
-    """The pair disturbed like real recordings; None if a scan is left without points."""
-    assert pair.annotation is not None
+    """The pair disturbed like real recordings; None if a scan is left with fewer than two points."""
+    truth = annotation_of(pair)
     whole = pair_of(ScanPairBatch.collate([pair]), 0)
     kept = _thin(len(pair.source), generator), _thin(len(pair.target), generator)
     if min(len(k) for k in kept) < 2:
@@ -131,9 +132,8 @@ def _view(pair: ScanPair, generator: torch.Generator) -> HypothesisView | None:
     source, target = grids_of(thin)
     unit = unit_length(source.scan, target.scan)
     source, _ = grids_of(thin._replace(source=_disturb(thin, unit, generator)))
-    motions = pair.annotation.motions
-    known = np.where(pair.annotation.ignore, IGNORED, pair.annotation.body)
-    body = known[pair.source.beam][kept[0]]
+    motions = truth.motions
+    body = np.where(truth.ignore, IGNORED, truth.body)[pair.source.beam][kept[0]]
     error = BACKGROUND_ERROR * unit * torch.randn(3, generator=generator).double().numpy()
     error[0] /= np.median(source.scan.ranges)
     if torch.rand((), generator=generator) < FOUND_SHARE:

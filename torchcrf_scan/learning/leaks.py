@@ -43,7 +43,7 @@ class TrainedOn:
         """The record of a saved model, or of a shipped one by name; an incomplete one is logged. An empty name: nothing.
 
         Raises:
-            ValueError: no such model, or a file that is no record.
+            TorchCRFScanError: no such model, or a file that is no record.
         """
         if not name_or_path:
             return cls()
@@ -65,7 +65,7 @@ class TrainedOn:
         write_whole(folder / RECORD, json.dumps(asdict(self), indent=1) + "\n")
 
     def refuse(self, tested: Iterable[ScanPair], setting: str) -> None:
-        """Raises ValueError if a tested pair is of one of the sequences: their pairs overlap in time.
+        """Raises TorchCRFScanError if a tested pair is of one of the sequences: their pairs overlap in time.
 
         setting: the one that names what was trained on.
         """

@@ -93,7 +93,7 @@ def collect(pairs: Sequence[ScanPair], config: LearningConfig, jobs: int = 1) ->
     """Surveys the pairs on `jobs` cores (-1: all); random draws for a pair do not depend on `jobs`.
 
     Raises:
-        ValueError: a pair without annotation, or no pair.
+        TorchCRFScanError: a pair without annotation, or no pair.
     """
     bare = [pair.name for pair in pairs if pair.annotation is None]
     if bare or not pairs:

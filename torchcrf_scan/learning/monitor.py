@@ -18,6 +18,7 @@ from torch.utils.tensorboard import SummaryWriter
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.choices import SCHEDULES
 from torchcrf_scan.evaluation.calibration import Sureness
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.evaluation.metrics import score_pairs
 from torchcrf_scan.evaluation.summary import summarise
 from torchcrf_scan.inference import pseudo_likelihood
@@ -149,7 +150,7 @@ class TrainingMonitor:
             "pair/clusters": plot_clusters(pair, first),
             "pair/confidence": plot_confidence(pair, joint_answer),
             "all/reliability": plot_reliability({name: of for name, of in by_kind.items() if len(of[0])}),
-            "all/moving points": plot_precision_recall({"joint": moving_points(answers)}),
+            "all/moving points": plot_precision_recall(*moving_points(answers)),
         }
         for name, figure in figures.items():
             self.writer.add_figure(name, figure, step, close=False)
@@ -159,9 +160,8 @@ def moving_points(answers: Answers) -> tuple[np.ndarray, np.ndarray]:
     """(P,) probability of moving of every return and (P,) whether it moves, for returns with an annotated body."""
     scores, truths = [], []
     for pair, score in zip(answers.pairs, answers.moving, strict=True):
-        assert pair.annotation is not None
-        beam = pair.source.beam
-        body, known = pair.annotation.body[beam], ~pair.annotation.ignore[beam]
+        truth, beam = annotation_of(pair), pair.source.beam
+        body, known = truth.body[beam], ~truth.ignore[beam]
         known &= body >= 0
         scores.append(score[known])
         truths.append(body[known] > 0)

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.calibration import rightness
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.inference.pseudo_likelihood import true_plugins
 from torchcrf_scan.inference.uncertainty import WITHIN
 from torchcrf_scan.learning.calibration_fit import Judged, fit_confidence, judge
@@ -28,7 +29,7 @@ from torchcrf_scan.learning.material import Material
 from torchcrf_scan.learning.scales_fit import fit_scales
 from torchcrf_scan.learning.selection_fit import fit_potential, judge_clusters
 from torchcrf_scan.learning.settings import LearningConfig
-from torchcrf_scan.model import JointScanCRF
+from torchcrf_scan.model import JointScanCRF, with_config
 from torchcrf_scan.scan import Floats, ScanPair
 
 FOLDS = 5  # at most
@@ -94,7 +95,7 @@ def calibrate_on(
             of outliers and the confidences stay, about which the model cannot learn from its own labels.
 
     Raises:
-        ValueError: fewer than two pairs, one without annotation, or a model of one chain.
+        TorchCRFScanError: fewer than two pairs, one without annotation, or a model of one chain.
     """
     is_certain = len(pairs) > 0
     pairs, also = (pairs, also) if is_certain else (also, ())
@@ -120,21 +121,15 @@ def folds_of(pairs: Sequence[ScanPair]) -> list[list[int]]:
     return [part.tolist() for part in np.array_split(np.arange(len(pairs)), min(FOLDS, len(pairs)))]
 
 
-def wrong_points(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
-    """(P,) annotated points of every pair whose association is more than two beams off or whose cluster is wrong."""
-    return errors(model, pairs)[:, 0]
-
-
 @torch.no_grad()
 def errors(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Floats:
-    """(P, 3) `wrong_points`, points wrongly called outliers or not, and points of movers called none's, of every pair."""
+    """(P, 3) wrong annotated points of every pair: by association or cluster, by outlier decision, movers' points called static."""
     found = []
     for pair, answer in zip(pairs, model.match_pairs(pairs), strict=True):
-        assert pair.annotation is not None
-        right, beam = rightness(pair, answer, WITHIN), pair.source.beam
-        is_confused = (pair.annotation.association[beam] < 0) != (answer.association[beam] < 0)
+        right, truth, beam = rightness(pair, answer, WITHIN), annotation_of(pair), pair.source.beam
+        is_confused = (truth.association[beam] < 0) != (answer.association[beam] < 0)
         is_wrong = ~(right.within & right.cluster)
-        is_lost = (pair.annotation.body[beam] > 0) & (answer.cluster[beam] <= 0)
+        is_lost = (truth.body[beam] > 0) & (answer.cluster[beam] <= 0)
         found.append([(right.known & mistake).sum() for mistake in (is_wrong, is_confused, is_lost)])
     return np.array(found, dtype=np.float64)
 
@@ -147,9 +142,7 @@ def gains(before: Floats, after: Floats) -> bool:
 
 def with_distance(model: JointScanCRF, metres: float) -> JointScanCRF:
     """A copy of the model with this distance of outliers."""
-    other = copy.copy(model)
-    other.config = model.config.with_limit(metres)
-    return other
+    return with_config(model, model.config.with_limit(metres))
 
 
 def fit_distance(model: JointScanCRF, given: Given) -> tuple[JointScanCRF, Part]:

@@ -14,6 +14,8 @@ from torchcrf_scan.inference.pseudo_likelihood import PlugIns, true_plugins
 from torchcrf_scan.inference.start import Start, beyond_reach
 from torchcrf_scan.learning.settings import LearningConfig
 
+TRAVEL_SHARE, LEAST_GAP = 0.15, 0.05  # tolerance of a motion: a share of the travel, and metres on top of twice the noise
+
 
 def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig, generator: torch.Generator) -> PlugIns:
     """True motions with noise for some pairs, InitialiseRT's for the others; spare slots hold its spurious movers (spec 2.5, 6.2).
@@ -34,7 +36,7 @@ def training_plugins(batch: ScanPairBatch, start: Start, config: LearningConfig,
 
 
 def match_start(batch: ScanPairBatch, start: Start, truth: PlugIns) -> Tensor:
-    """(B, C, C') whether found motion k' matches true cluster k: at most one each, within a quarter metre or of the travel."""
+    """(B, C, C') whether found motion k' matches true cluster k: at most one each, within `matching_tolerance`."""
     clusters = torch.arange(truth.motions.shape[1], device=truth.label.device)
     members = (truth.label[:, None] == clusters[:, None]).to(batch.source)  # (B, C, N)
     share = members / members.sum(-1, keepdim=True).clamp(min=1)
@@ -43,11 +45,15 @@ def match_start(batch: ScanPairBatch, start: Start, truth: PlugIns) -> Tensor:
     offset = torch.linalg.vector_norm(true_points[:, :, None] - found_points[:, None], dim=-1)  # (B, C, C', N)
     error = (offset * share[:, :, None]).sum(-1)  # (B, C, C')
     travel = (torch.linalg.vector_norm(true_points - true_points[:, :1], dim=-1) * share).sum(-1)  # (B, C)
-    tolerance = torch.maximum(0.15 * travel, 2 * batch.range_noise[:, None] + 0.05)
     error = error.masked_fill(~(truth.active & (members.sum(-1) > 0))[:, :, None] | ~start.active[:, None], torch.inf)
     best = error == error.amin(-1, keepdim=True)
     both = best & (error == error.amin(1, keepdim=True))
-    return both & (error < tolerance[..., None])
+    return both & (error < matching_tolerance(batch, travel)[..., None])
+
+
+def matching_tolerance(batch: ScanPairBatch, travel: Tensor) -> Tensor:
+    """(B, C) metres up to which a motion matches that of a cluster which travels so far (B, C)."""
+    return torch.maximum(TRAVEL_SHARE * travel, 2 * batch.range_noise[:, None] + LEAST_GAP)
 
 
 def fill_spare_slots(plugins: PlugIns, batch: ScanPairBatch, start: Start, stands_for: Tensor) -> PlugIns:

@@ -70,7 +70,7 @@ def join(device: str = "auto", environment: Mapping[str, str] = os.environ) -> I
     device: `auto`, `cpu` or `cuda`.
 
     Raises:
-        ValueError: `cuda` on a machine without.
+        TorchCRFScanError: `cuda` on a machine without.
     """
     has_gpu = torch.cuda.is_available()
     if device == "cuda" and not has_gpu:

@@ -51,7 +51,7 @@ def load(config: Config, ranks: Ranks) -> RunData:
     """The pairs of a run, the same in every process.
 
     Raises:
-        ValueError: none to learn from, a sequence both learned from and tested, or too few sequences to hold one out.
+        TorchCRFScanError: none to learn from, a sequence both learned from and tested, or too few sequences to hold one out.
     """
     trained_on = TrainedOn.of_model(config.init)  # fails early if there is no such model
     train, test = load_annotated(config.data)
@@ -72,8 +72,7 @@ def load_annotated(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
         raise TorchCRFScanError("data.simulate_train: expected a world at least where data.train names no files, got none")
 
     def read(patterns: tuple[str, ...] | str, worlds: tuple[str, ...], seed: int) -> list[ScanPair]:
-        patterns = (patterns,) if isinstance(patterns, str) else patterns
-        pairs = list(PairFiles(*patterns)) if patterns else []
+        pairs = read_files(patterns)
         for k, world in enumerate(worlds):
             pairs += simulate_pairs(NAMED_WORLDS[world], config.pairs, config.sequences, seed + k)
         return pairs
@@ -82,6 +81,12 @@ def load_annotated(config: DataConfig) -> tuple[list[ScanPair], list[ScanPair]]:
         read(config.train, config.simulate_train, config.seed),
         read(config.test, config.simulate_test, config.seed + TEST_SEED),
     )
+
+
+def read_files(patterns: tuple[str, ...] | str) -> list[ScanPair]:
+    """The pairs of files, folders or glob patterns; none without a pattern."""
+    patterns = (patterns,) if isinstance(patterns, str) else patterns
+    return list(PairFiles(*patterns)) if patterns else []
 
 
 def label_unlabelled(config: Config, annotated: Sequence[ScanPair]) -> list[ScanPair]:
@@ -103,7 +108,7 @@ def hold_out(pairs: list[ScanPair], config: Config) -> tuple[list[ScanPair], lis
     """Training and validation pairs, sequences whole; all for training without first-order training.
 
     Raises:
-        ValueError: too few sequences to hold one out.
+        TorchCRFScanError: too few sequences to hold one out.
     """
     if not config.has_steps or config.gradient.validation == 0:
         return pairs, []

@@ -33,7 +33,7 @@ def robust_scale(errors: Tensor, floor: float) -> Tensor:
 def fit_scales(views: Sequence[PairView], plugins: Sequence[PlugIns]) -> Scales:
     """Robust scales of every error over the true pairs, then the features' values at the outlier state (their worst tenth).
 
-    Works in float64; raises ValueError if no pair has an association.
+    Works in float64; raises TorchCRFScanError if no pair has an association.
     """
     parts = [true_errors(view, plug) for view, plug in zip(views, plugins, strict=True)]
     errors = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

@@ -21,6 +21,7 @@ from torchcrf_scan.data.annotate import scan_gate
 from torchcrf_scan.data.formats import read_scans
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.recording import log_name
+from torchcrf_scan.evaluation.counterparts import annotation_of
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.result import MovingObject, ScanResult
@@ -66,7 +67,7 @@ def label_recordings(model: JointScanCRF, paths: Iterable[str | Path], most: int
         seconds: between the scans of a pair, at least about so many.
 
     Raises:
-        ValueError: a file that is no recording, or damaged.
+        TorchCRFScanError: a file that is no recording, or damaged.
     """
     pairs: list[ScanPair] = []
     for path in paths:
@@ -108,10 +109,9 @@ def weighted(model: JointScanCRF, pairs: Sequence[ScanPair]) -> list[ScanPair]:
     """The pairs, their weights the model's mean confidence in their clusters; 0 counts for what is not labelled."""
     weighed = []
     for pair, answer in zip(pairs, model.match_pairs(pairs) if pairs else [], strict=True):
-        assert pair.annotation is not None
-        beam = pair.source.beam
-        sure = np.where(pair.annotation.ignore[beam], 0.0, answer.cluster_confidence[beam])
-        weighed.append(replace(pair, annotation=replace(pair.annotation, weight=float(sure.mean()))))
+        truth, beam = annotation_of(pair), pair.source.beam
+        sure = np.where(truth.ignore[beam], 0.0, answer.cluster_confidence[beam])
+        weighed.append(replace(pair, annotation=replace(truth, weight=float(sure.mean()))))
     return weighed
 
 

@@ -268,7 +268,13 @@ def write_results(folder: Path, scores: dict[str, list[PairScore]], tables: Sequ
 def versions() -> dict[str, str]:
     """Versions of the packages used and of the code."""
     found = {name: version(name) for name in ("torchcrf-scan", "torch", "numpy", "scikit-learn", "scipy")}
-    commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False
-    ).stdout.strip()
-    return {"python": platform.python_version(), **found, "git": commit or "unknown"}
+    return {"python": platform.python_version(), **found, "git": commit() or "unknown"}
+
+
+def commit() -> str:
+    """The commit of the code; empty without git, or outside of a repository."""
+    command = ["git", "rev-parse", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parent, check=False).stdout.strip()
+    except OSError:
+        return ""

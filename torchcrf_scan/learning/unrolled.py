@@ -26,12 +26,12 @@ from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.inference.state import State
 from torchcrf_scan.learning.objectives import Objective, start_of
+from torchcrf_scan.learning.plugins import matching_tolerance
 from torchcrf_scan.learning.portions import Portion
 from torchcrf_scan.learning.settings import Config, UnrolledConfig
 from torchcrf_scan.model import JointScanCRF
 
 LEAST_LIKENESS = 0.5  # least similarity of a match: half of the points, or a motion just within the tolerance
-TRAVEL_SHARE, LEAST_GAP = 0.15, 0.05  # tolerance of that motion: a share of the mover's travel; metres, on top of twice the noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +223,7 @@ def match_clusters(batch: ScanPairBatch, state: State, temperature: float) -> Te
 
 
 def closeness(batch: ScanPairBatch, share: Tensor, motions: Tensor) -> Tensor:
-    """(B, G, C) agreement of motions with a true cluster's on its points: 1 if equal, 1/2 at the tolerance of `match_start`.
+    """(B, G, C) agreement of motions with a true cluster's on its points: 1 if equal, 1/2 at `matching_tolerance`.
 
     share: (B, G, N) of the cluster's points; motions: (B, C, 3). 0 where the true motion is unknown.
     """
@@ -234,7 +234,7 @@ def closeness(batch: ScanPairBatch, share: Tensor, motions: Tensor) -> Tensor:
         [(torch.linalg.vector_norm(true_points - points[:, c, None], dim=-1) * share).sum(-1) for c in range(motions.shape[1])], -1
     )  # one motion at a time, so that the largest tensor is (B, G, N, 2)
     travel = (torch.linalg.vector_norm(true_points - true_points[:, :1], dim=-1) * share).sum(-1)
-    tolerance = torch.maximum(TRAVEL_SHARE * travel, 2 * batch.range_noise[:, None] + LEAST_GAP)
+    tolerance = matching_tolerance(batch, travel)
     is_known = truth.motions.isfinite().all(-1)
     return torch.where(is_known[..., None], 1 / (1 + (error / tolerance[..., None]) ** 2), 0.0)
 

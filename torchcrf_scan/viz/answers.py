@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchcrf_scan.errors import TorchCRFScanError
-from torchcrf_scan.evaluation.counterparts import beams_apart, match_movers
+from torchcrf_scan.evaluation.counterparts import annotation_of, beams_apart, match_movers
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction, ScanPair
 
 ASSOCIATION_TOLERANCE = 2  # beams; associations within this distance are drawn as right
@@ -48,7 +48,7 @@ def true_labels(pair: ScanPair) -> Labels | None:
 
 
 def predicted_labels(pair: ScanPair, name: str, prediction: PairPrediction, truth: Labels | None) -> Labels:
-    """The predicted labels, movers numbered as the true ones; raises ValueError, with the name, if they do not fit the pair."""
+    """The predicted labels, movers numbered as the true ones; raises TorchCRFScanError if they do not fit the pair."""
     labels = _labels(pair, name, prediction)
     return labels if truth is None else _renumber(labels, truth)
 
@@ -79,15 +79,14 @@ def _renumber(labels: Labels, truth: Labels) -> Labels:
 
 def judge(name: str, drawn: Labels, pair: ScanPair, guess: Labels, truth: Labels) -> Answer:
     """The labels `drawn` with the mistakes of `guess`; unannotated points are never mistakes."""
-    assert pair.annotation is not None
-    known = ~pair.annotation.ignore
+    known = ~annotation_of(pair).ignore
     known &= pair.source.to_beams(np.ones(len(pair.source), dtype=bool), False)
     near = beams_apart(pair.target, guess.association, truth.association) <= ASSOCIATION_TOLERANCE
     return Answer(name, drawn, known & ~near, known & (guess.cluster != truth.cluster))
 
 
 def all_answers(pair: ScanPair, predictions: Mapping[str, PairPrediction], before: Labels | None = None) -> list[Answer]:
-    """The methods' labels in their order, then the true ones; raises ValueError if there are none.
+    """The methods' labels in their order, then the true ones; raises TorchCRFScanError if there are none.
 
     before: true labels that the pair's are numbered after, see `carried_on`; None: numbers of the annotation.
     """

@@ -37,32 +37,17 @@ def plot_reliability(answers: dict[str, tuple[ArrayLike, ArrayLike]]) -> Figure:
     return figure
 
 
-def precision_recall(score: Floats, is_positive: ArrayLike) -> tuple[Floats, Floats, float]:
-    """Precision and recall at every threshold, from the highest score down, and the average precision (NaN without positives).
+def plot_precision_recall(score: Floats, is_moving: ArrayLike) -> Figure:
+    """Precision against recall of moving points, without a curve if none moves. score: (P,). is_moving: (P,) bool."""
+    from sklearn.metrics import average_precision_score, precision_recall_curve
 
-    score: (P,). is_positive: (P,) bool. Returns (T,), (T,) for T different scores.
-    """
-    positive = np.asarray(is_positive, dtype=bool)
-    order = np.argsort(-score, kind="stable")
-    right = np.cumsum(positive[order])
-    last = np.append(np.diff(score[order]) != 0, True) if len(score) else np.zeros(0, dtype=bool)  # equal scores form one threshold
-    precision = right[last] / np.arange(1, len(score) + 1)[last]
-    if not positive.any():
-        return precision, np.full(len(precision), np.nan), float("nan")
-    recall = right[last] / positive.sum()
-    return precision, recall, float((np.diff(recall, prepend=0.0) * precision).sum())
-
-
-def plot_precision_recall(curves: dict[str, tuple[Floats, ArrayLike]]) -> Figure:
-    """Precision against recall of moving points. curves: name -> (P,) scores and (P,) whether the point moves."""
     figure, (ax,) = _panels(1)
-    for (name, (score, moving)), color in zip(curves.items(), (SOURCE, TARGET, INK, NOTE), strict=False):
-        precision, recall, average = precision_recall(score, moving)
-        # steps: the area under the curve is then the average precision
-        ax.step(np.append(0 * recall[:1], recall), np.append(precision[:1], precision), where="pre", color=color,
-                label=f"{name}: average precision {average:.2f}")  # fmt: skip
     _frame(ax, "moving points", "recall", "precision")
-    ax.legend(loc="lower left", fontsize=7)
+    if np.any(is_moving):
+        precision, recall, _ = precision_recall_curve(is_moving, score)
+        name = f"average precision {average_precision_score(is_moving, score):.2f}"
+        ax.step(recall, precision, where="post", color=SOURCE, label=name)  # the area below the steps is the average precision
+        ax.legend(loc="lower left", fontsize=7)
     return figure
 
 

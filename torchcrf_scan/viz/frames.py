@@ -9,7 +9,7 @@ from torchcrf_scan.result import MovingObject, ScanResult
 from torchcrf_scan.scan import BACKGROUND, Floats
 from torchcrf_scan.viz.camera import Camera, nice_step
 from torchcrf_scan.viz.canvas import Canvas, Image
-from torchcrf_scan.viz.history import Path, StaticMap
+from torchcrf_scan.viz.history import Path, StaticMap, static_points
 from torchcrf_scan.viz.marks import INK, NOTE, mover_look
 
 SIZE = (800, 600)  # pixels
@@ -48,15 +48,12 @@ class FramePainter:
         self._begin = result.stamp if self._now is None else self._begin
         self._now = result
         self._count += 1
-        points = result.scan.points[_is_static(result)]
-        if result.status != "lost":
-            typical = float(np.percentile(result.scan.ranges, 75)) if len(result.scan) else 1.0
-            self._map.add(se2.apply(result.pose, points), typical)
+        self._map.add_scan(result)
         self._path.add(*result.pose)
         self._lengthen_tails(result)
         view = np.zeros(3) if self._in_world else se2.inverse(result.pose)
         sensor = se2.compose(view, result.pose)
-        self._camera.follow(se2.apply(sensor, points), sensor[1:])
+        self._camera.follow(se2.apply(sensor, static_points(result)), sensor[1:])
         height = float(np.diff(np.stack(self._camera.window)[:, 1], axis=0)[0])
         fastest = max((float(np.hypot(*one.velocity)) for one in result.objects), default=0.0)
         while self._arrow + 1 < len(ARROW_SECONDS) and fastest * ARROW_SECONDS[self._arrow] > ARROW_SHARE * height:
@@ -188,11 +185,6 @@ def _grid(low: Floats, high: Floats, step: float) -> list[Floats]:
     """The lines of a grid that cross a window."""
     xs, ys = (step * np.arange(np.ceil(a / step), np.floor(b / step) + 1) for a, b in zip(low, high, strict=True))
     return [np.array([[x, low[1]], [x, high[1]]]) for x in xs] + [np.array([[low[0], y], [high[0], y]]) for y in ys]
-
-
-def _is_static(result: ScanResult) -> np.ndarray:
-    """(N,) of the scan's points: of the background, and not moving."""
-    return (result.track == BACKGROUND)[result.scan.beam] & ~result.moving[result.scan.beam]
 
 
 def _short(text: str) -> str:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from torchcrf_scan.geometry import se2
 from torchcrf_scan.result import MovingObject, ScanResult, Status
-from torchcrf_scan.scan import Floats
+from torchcrf_scan.scan import BACKGROUND, Floats
 
 PATH = 4000  # rows of a path that are kept at most
 CELLS = 60_000  # of a map
@@ -94,15 +95,15 @@ class StaticMap:
     """Where static points were seen: the mean of them in every cell of a grid, which becomes coarser when there are too many."""
 
     def __init__(self, limit: int = CELLS) -> None:
-        self._limit, self._cell = limit, 0.0
+        self._limit, self._cell = limit, 0.0  # metres; 0 before the first points
         self._index: dict[tuple[int, int], int] = {}
         self._sums = np.zeros((limit, 2))
         self._hits = np.zeros(limit)
 
-    @property
-    def cell(self) -> float:
-        """Metres; 0 before the first points."""
-        return self._cell
+    def add_scan(self, result: ScanResult) -> None:
+        """Adds the static points of a scan, unless its pose is lost."""
+        if result.status != "lost" and len(result.scan):
+            self.add(se2.apply(result.pose, static_points(result)), float(np.percentile(result.scan.ranges, 75)))
 
     def add(self, points: Floats, reach: float) -> None:
         """Adds the static points of a scan. points: (N, 2) in the world; reach: a typical range, for the size of the cells."""
@@ -135,6 +136,12 @@ class StaticMap:
         self._index.clear()
         self._sums[:used], self._hits[:used] = 0.0, 0.0
         self._insert(sums[keep] / hits[keep, None], sums[keep], hits[keep])
+
+
+def static_points(result: ScanResult) -> Floats:
+    """(P, 2) the scan's points of the background that do not move, in the sensor's frame."""
+    beam = result.scan.beam
+    return result.scan.points[(result.track[beam] == BACKGROUND) & ~result.moving[beam]]
 
 
 class TrackPaths:

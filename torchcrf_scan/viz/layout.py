@@ -42,15 +42,20 @@ def draw_frame(ax: Axes, window: Window, title: str, note: str, mistakes: str = 
     ax.set_xlim(x, x_end)
     ax.set_ylim(y, y_end)
     ax.set_autoscale_on(False)
+    draw_grid(ax)
+    left = ax.set_title(title, loc="left", fontsize=11, fontweight="bold", color=INK, pad=19, parse_math=False)
+    right = ax.set_title(mistakes, loc="right", fontsize=9, color=WRONG, pad=19)
+    _shrink(left, 0.84 * PANEL_HEIGHT * float((x_end - x) / (y_end - y)) - _width(right))  # 0.84: ticks and gaps take the rest
+    ax.text(0.0, 1.015, note, transform=ax.transAxes, fontsize=8.5, color=NOTE, va="bottom", in_layout=False)
+
+
+def draw_grid(ax: Axes) -> None:
+    """A pale grid below the marks, and a pale frame."""
     ax.grid(color="#E6E8EB", lw=0.6)
     ax.set_axisbelow(True)
     ax.tick_params(labelsize=7, color="#B8BEC5", labelcolor=NOTE, length=2.5)
     for spine in ax.spines.values():
         spine.set_color("#B8BEC5")
-    left = ax.set_title(title, loc="left", fontsize=11, fontweight="bold", color=INK, pad=19, parse_math=False)
-    right = ax.set_title(mistakes, loc="right", fontsize=9, color=WRONG, pad=19)
-    _shrink(left, 0.84 * PANEL_HEIGHT * float((x_end - x) / (y_end - y)) - _width(right))  # 0.84: ticks and gaps take the rest
-    ax.text(0.0, 1.015, note, transform=ax.transAxes, fontsize=8.5, color=NOTE, va="bottom", in_layout=False)
 
 
 def _shrink(text: Text, room: float) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchcrf_scan.scan import BACKGROUND, Bools, Floats
 from torchcrf_scan.viz.answers import Labels
-from torchcrf_scan.viz.scene import Scene, mover_velocities
+from torchcrf_scan.viz.scene import Scene, Window, mover_velocities
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,6 +94,12 @@ def _speed_label(ax: Axes, scene: Scene, tip: Floats, velocity: Floats, color: s
         ha=side, va="bottom" if up else "top", fontsize=9, fontweight="bold", color=color,
         bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 0.6}, in_layout=False, zorder=7,
     )  # fmt: skip
+
+
+def draw_box(ax: Axes, window: Window) -> None:
+    """The dashed outline of a window that is magnified elsewhere."""
+    (x, y), (x_end, y_end) = window
+    ax.plot([x, x_end, x_end, x, x], [y, y, y_end, y_end, y], color=INK, lw=0.8, ls=(0, (4, 3)), zorder=5)
 
 
 def draw_sensor(ax: Axes, position: Floats, color: str) -> None:

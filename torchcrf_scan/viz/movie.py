@@ -38,7 +38,7 @@ def can_write_mp4() -> bool:
 
 
 def check_movie(option: str, path: str | Path) -> Path:
-    """The path of a movie that can be written here; raises ValueError otherwise."""
+    """The path of a movie that can be written here; raises TorchCRFScanError otherwise."""
     ending = Path(path).suffix.lower()
     if ending not in ENDINGS:
         raise TorchCRFScanError(f"{option}: expected a name ending in {' or '.join(ENDINGS)}, got {path}")

@@ -27,6 +27,7 @@ from torchcrf_scan.viz.marks import (
     STATIC,
     TARGET,
     draw_arrows,
+    draw_box,
     draw_dots,
     draw_lines,
     draw_outliers,
@@ -51,7 +52,7 @@ def plot_pair(pair: ScanPair, prediction: PairPrediction | None = None) -> Figur
     movers' velocities and the sensor's motion; the largest mover magnified. Rows and columns without content are left out.
 
     Raises:
-        ValueError: the prediction does not fit the pair.
+        TorchCRFScanError: the prediction does not fit the pair.
     """
     truth = true_labels(pair)
     guess = None if prediction is None else predicted_labels(pair, "prediction", prediction, truth)
@@ -82,7 +83,7 @@ def plot_associations(pair: ScanPair, predictions: Mapping[str, PairPrediction])
         predictions: method name -> its prediction of this pair.
 
     Raises:
-        ValueError: there is nothing to draw, or a prediction does not fit the pair.
+        TorchCRFScanError: there is nothing to draw, or a prediction does not fit the pair.
     """
     answers = all_answers(pair, predictions)
     scene = make_scene(pair, [answer.labels for answer in reversed(answers)])
@@ -104,7 +105,7 @@ def plot_clusters(pair: ScanPair, predictions: Mapping[str, PairPrediction]) -> 
         predictions: method name -> its prediction of this pair.
 
     Raises:
-        ValueError: there is nothing to draw, or a prediction does not fit the pair.
+        TorchCRFScanError: there is nothing to draw, or a prediction does not fit the pair.
     """
     answers = all_answers(pair, predictions)
     scene = make_scene(pair, [answer.labels for answer in reversed(answers)])
@@ -118,7 +119,7 @@ def save_figure(figure: Figure, path: str | os.PathLike[str], dpi: float = 130.0
     """Writes a PNG atomically; creates missing folders.
 
     Raises:
-        ValueError: `path` does not end in .png.
+        TorchCRFScanError: `path` does not end in .png.
     """
     path = Path(path)
     if path.suffix.lower() != ".png":
@@ -154,8 +155,7 @@ def _draw_associations(ax: Axes, scene: Scene, answer: Answer, title: str) -> No
     draw_frame(ax, scene.window, title, f"{outliers} outliers", _mistakes(answer.wrong_association, scene))
     _associations(ax, scene, answer, size=2.4)
     if scene.zoom is not None:
-        (x, y), (x_end, y_end) = scene.zoom
-        ax.plot([x, x_end, x_end, x, x], [y, y, y_end, y_end, y], color=INK, lw=0.8, ls=(0, (4, 3)), zorder=5)
+        draw_box(ax, scene.zoom)
     draw_sensor(ax, np.zeros(2), INK)
 
 

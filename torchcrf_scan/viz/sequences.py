@@ -15,7 +15,7 @@ from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, PairPrediction, ScanPair
 from torchcrf_scan.viz.answers import Answer, Labels, all_answers, carried_on
 from torchcrf_scan.viz.layout import draw_frame, finish, make_canvas
-from torchcrf_scan.viz.marks import INK, STATIC, draw_dots, draw_lines, draw_outliers, draw_rings, draw_sensor, mover_look
+from torchcrf_scan.viz.marks import INK, STATIC, draw_box, draw_dots, draw_lines, draw_outliers, draw_rings, draw_sensor, mover_look
 from torchcrf_scan.viz.scene import Scene, Window, join_windows, make_scene, zoom_on
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def plot_association_sequence(pairs: Sequence[ScanPair], predictions: Mapping[st
         pairs: P annotated pairs, each beginning with the scan that ends the one before. predictions: method -> its P predictions.
 
     Raises:
-        ValueError: a pair without annotation, or a prediction that does not fit its pair.
+        TorchCRFScanError: a pair without annotation, or a prediction that does not fit its pair.
     """
     methods, zoom = _steps(pairs, predictions)
     scene = methods[0][0].scene
@@ -66,8 +66,7 @@ def plot_association_sequence(pairs: Sequence[ScanPair], predictions: Mapping[st
     for column, steps in enumerate(methods):
         _draw_panel(axes[0][column], scene.window, steps, _associations)
         if zoom is not None:
-            (x, y), (x_end, y_end) = zoom
-            axes[0][column].plot([x, x_end, x_end, x, x], [y, y, y_end, y_end, y], color=INK, lw=0.8, ls=(0, (4, 3)), zorder=5)
+            draw_box(axes[0][column], zoom)
             draw_frame(axes[1][column], zoom, "magnified", "the largest mover (dashed box)")
             for step in steps:
                 _associations(axes[1][column], step, 4.0)

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchcrf_scan.geometry import se2
 from torchcrf_scan.result import ScanResult, Status
-from torchcrf_scan.scan import BACKGROUND, Floats
+from torchcrf_scan.scan import Floats
 from torchcrf_scan.viz.frames import STATUS_COLORS
 from torchcrf_scan.viz.history import STATUSES, Path, StaticMap, Tally, TrackPaths, travelled
+from torchcrf_scan.viz.layout import draw_grid
 from torchcrf_scan.viz.lettering import drawable
 from torchcrf_scan.viz.marks import INK, NOTE, mover_look
 from torchcrf_scan.viz.scene import Window
@@ -41,10 +41,7 @@ class Summary:
     def add(self, result: ScanResult) -> None:
         """Adds one result."""
         self.tally.add(result)
-        scan = result.scan
-        static = (result.track == BACKGROUND)[scan.beam] & ~result.moving[scan.beam]
-        if result.status != "lost":
-            self._map.add(se2.apply(result.pose, scan.points[static]), float(np.percentile(scan.ranges, 75)) if len(scan) else 1.0)
+        self._map.add_scan(result)
         self._tracks.add(result.stamp, result.objects)
         speed = float(np.hypot(*result.twist[1:]))
         self._path.add(result.stamp, *result.pose[1:], speed, len(result.objects), STATUSES.index(result.status))
@@ -156,12 +153,8 @@ def _window(points: Floats) -> Window:
 
 
 def _frame(ax: Axes, label: str = "") -> None:
-    ax.grid(color="#E6E8EB", lw=0.6)
-    ax.set_axisbelow(True)
-    ax.tick_params(labelsize=7.5, color="#B8BEC5", labelcolor=NOTE, length=2.5)
+    draw_grid(ax)
     ax.set_ylabel(label, fontsize=8.5, color=NOTE)
-    for spine in ax.spines.values():
-        spine.set_color("#B8BEC5")
 
 
 def _rim() -> list[Any]:

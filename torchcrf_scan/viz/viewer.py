@@ -36,7 +36,7 @@ Show = Callable[[ScanResult], None]
 
 
 def check_viewer(option: str) -> None:
-    """Raises ValueError if the extra `viewer` is not installed."""
+    """Raises TorchCRFScanError if the extra `viewer` is not installed."""
     try:
         import rerun  # noqa: F401
     except ImportError as error:

@@ -34,7 +34,7 @@ from torchcrf_scan.evaluation.causes.movers import (
 )
 from torchcrf_scan.evaluation.causes.outliers import nearest_targets
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
-from torchcrf_scan.evaluation.counterparts import beams_apart
+from torchcrf_scan.evaluation.counterparts import annotation_of, beams_apart
 from torchcrf_scan.evaluation.metrics import PairScore
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Ints, PairPrediction, ScanPair
 
@@ -103,10 +103,9 @@ def blame(pair: ScanPair, prediction: PairPrediction, trace: SearchTrace, score:
         prediction: the answer of the search that `trace` tells of. score: of this answer (`metrics.score_pair`).
 
     Raises:
-        ValueError: a pair without annotation.
+        TorchCRFScanError: a pair without annotation.
     """
-    right, truth, beam = rightness(pair, prediction, NEAR), pair.annotation, pair.source.beam
-    assert truth is not None
+    right, truth, beam = rightness(pair, prediction, NEAR), annotation_of(pair), pair.source.beam
     cluster = prediction.cluster[beam]
     body, movers = _movers_of(pair, truth, trace)
     states = {number: state_of(mover, truth, cluster, prediction.motions, trace) for number, mover in movers.items()}
@@ -137,8 +136,7 @@ def blame(pair: ScanPair, prediction: PairPrediction, trace: SearchTrace, score:
 
 def _is_led_astray(pair: ScanPair, prediction: PairPrediction, body: Ints) -> Bools:
     """(N,) whether a point's nearest target is right, within `NEAR` beams, under its body's true motion, not under the answered."""
-    truth, beam = pair.annotation, pair.source.beam
-    assert truth is not None
+    truth, beam = annotation_of(pair), pair.source.beam
     _, by_truth = nearest_targets(pair, truth.motions, body)
     _, by_answer = nearest_targets(pair, prediction.motions, prediction.cluster[beam])
     off, found_off = (beams_apart(pair.target, truth.association[beam], nearest) for nearest in (by_truth, by_answer))

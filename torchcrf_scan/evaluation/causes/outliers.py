@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from torchcrf_scan.evaluation.counterparts import clusters_beneath
+from torchcrf_scan.evaluation.counterparts import annotation_of, clusters_beneath
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Bools, Floats, Ints, PairPrediction, ScanPair
 
@@ -35,8 +35,7 @@ def with_true_outliers(pair: ScanPair, prediction: PairPrediction) -> PairPredic
 
     A point taken back gets the cluster of the nearest answered inlier, and the nearest target point under that cluster's motion.
     """
-    truth, beam = pair.annotation, pair.source.beam
-    assert truth is not None
+    truth, beam = annotation_of(pair), pair.source.beam
     association, cluster = prediction.association.copy(), prediction.cluster.copy()
     beneath = clusters_beneath(pair, prediction)
     _, nearest = nearest_targets(pair, prediction.motions, beneath)
@@ -63,8 +62,7 @@ class OutlierCase:
     @classmethod
     def of(cls, pair: ScanPair, prediction: PairPrediction) -> OutlierCase:
         """The case of an annotated pair."""
-        truth, beam = pair.annotation, pair.source.beam
-        assert truth is not None
+        truth, beam = annotation_of(pair), pair.source.beam
         distance, _ = nearest_targets(pair, prediction.motions, clusters_beneath(pair, prediction))
         known = ~truth.ignore[beam]
         return cls(distance[known], truth.association[beam][known] < 0, prediction.association[beam][known] < 0)

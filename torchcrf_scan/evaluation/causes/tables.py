@@ -9,6 +9,7 @@ from typing import Any
 from torchcrf_scan.evaluation.causes.blame import CAUSES, Blame
 from torchcrf_scan.evaluation.causes.movers import FALSE_KINDS, FATES
 from torchcrf_scan.evaluation.causes.outliers import Gate, OutlierCase, best_gate
+from torchcrf_scan.evaluation.measures import percent
 from torchcrf_scan.evaluation.table import Cell, Table
 
 MOST_SEQUENCES = 6  # with columns of their own
@@ -42,16 +43,16 @@ def causes_table(blames: Sequence[Blame]) -> Table:
     rows = [_cause_row(name, k, blames, parts) for k, name in enumerate(CAUSES)]
     wrong, points = sum(of.wrong for of in blames), sum(of.points for of in blames)
     pairs = sum(of.wrong > 0 for of in blames)
-    shares = [_percent(sum(of.wrong for of in part), sum(of.points for of in part)) for part in parts.values()]
+    shares = [percent(sum(of.wrong for of in part), sum(of.points for of in part)) for part in parts.values()]
     rows.append(("all wrong points", float(wrong), 100.0 if wrong else float("nan"), float(pairs), *(100.0 for _ in parts)))
-    rows.append(("share of all points (%)", float(points), _percent(wrong, points), float(len(blames)), *shares))
+    rows.append(("share of all points (%)", float(points), percent(wrong, points), float(len(blames)), *shares))
     columns = ("cause", "points", "share of wrong (%)", "pairs", *(f"{name or 'no sequence'} (%)" for name in parts))
     return Table("Where wrong points come from", columns, tuple(rows), (0, 0, 1, 0, *(1 for _ in parts)), CAUSES_NOTE)
 
 
 def _cause_row(name: str, k: int, blames: Sequence[Blame], parts: Mapping[str, Sequence[Blame]]) -> tuple[Cell, ...]:
     def share(part: Sequence[Blame]) -> float:
-        return _percent(sum(int(of.counts[k]) for of in part), sum(of.wrong for of in part))
+        return percent(sum(int(of.counts[k]) for of in part), sum(of.wrong for of in part))
 
     counts = [int(of.counts[k]) for of in blames]
     return (name, float(sum(counts)), share(blames), float(sum(n > 0 for n in counts)), *map(share, parts.values()))
@@ -60,7 +61,7 @@ def _cause_row(name: str, k: int, blames: Sequence[Blame], parts: Mapping[str, S
 def fates_table(blames: Sequence[Blame]) -> Table:
     """True movers by what became of them, and answered movers that are none by kind."""
     fates = [mover.fate for of in blames for mover in of.fates]
-    rows: list[tuple[Cell, ...]] = [(fate, float(fates.count(fate)), _percent(fates.count(fate), len(fates))) for fate in FATES]
+    rows: list[tuple[Cell, ...]] = [(fate, float(fates.count(fate)), percent(fates.count(fate), len(fates))) for fate in FATES]
     rows.append(("all movers", float(len(fates)), 100.0 if fates else float("nan")))
     false = {kind: sum(of.false_movers[kind] for of in blames) for kind in FALSE_KINDS}
     rows += [(f"false mover: {kind}", float(count), float("nan")) for kind, count in false.items()]
@@ -70,7 +71,7 @@ def fates_table(blames: Sequence[Blame]) -> Table:
 def oracles_table(wrong: int, oracles: Mapping[str, int]) -> Table:
     """Wrong points of today's answer and of every oracle's."""
     rows = [("the answer as it is", float(wrong), float("nan"))]
-    rows += [(name, float(count), _percent(wrong - count, wrong)) for name, count in oracles.items()]
+    rows += [(name, float(count), percent(wrong - count, wrong)) for name, count in oracles.items()]
     return Table("What oracles would save", ("known", "wrong points", "fewer by (%)"), tuple(rows), (0, 0, 1), ORACLES_NOTE)
 
 
@@ -88,7 +89,7 @@ def gates_table(gates: Mapping[str, Gate]) -> Table:
             float(of.answered),
             float(of.errors),
             float(of.answered - of.errors),
-            _percent(of.answered - of.errors, of.answered),
+            percent(of.answered - of.errors, of.answered),
         )
         for name, of in gates.items()
     )
@@ -107,7 +108,7 @@ def worst_table(blames: Sequence[Blame], count: int) -> Table:
     rows = []
     for of in (blames[b] for b in worst_of(blames, count)):
         counts = of.counts
-        rows.append((of.name, float(of.wrong), _percent(of.wrong, of.points), CAUSES[counts.argmax()], float(counts.max())))
+        rows.append((of.name, float(of.wrong), percent(of.wrong, of.points), CAUSES[counts.argmax()], float(counts.max())))
     columns = ("pair", "wrong points", "of its points (%)", "most frequent cause", "by it")
     return Table("The worst pairs", columns, tuple(rows), (0, 0, 1, 0, 0))
 
@@ -132,8 +133,3 @@ def _counted(blames: Sequence[Blame]) -> dict[str, Any]:
         "fates": {fate: fates.count(fate) for fate in FATES},
         "false_movers": {kind: sum(of.false_movers[kind] for of in blames) for kind in FALSE_KINDS},
     }
-
-
-def _percent(part: float, whole: float) -> float:
-    """Percentage, NaN of nothing."""
-    return 100 * part / whole if whole else float("nan")
