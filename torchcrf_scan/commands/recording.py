@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from tqdm import tqdm
 
-from torchcrf_scan.commands.arguments import load_model
+from torchcrf_scan.commands.arguments import check_other, load_model
 from torchcrf_scan.commands.failures import LeftOut
 from torchcrf_scan.commands.outputs import Add, Output, Outputs, viewers
 from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
@@ -134,7 +134,7 @@ def chosen(readings: Iterable[Reading], options: Options) -> Iterator[Reading]:
     clock, count = Clock(warns=False), 0  # the stream warns
     for reading in readings:
         clock.advance(reading.stamp)
-        since = clock.now
+        since = clock.elapsed
         if options.end is not None and since > options.end + ROUNDING:
             return
         if since >= options.start - ROUNDING:
@@ -214,6 +214,8 @@ def typical_seconds(readings: list[Reading]) -> float:
 def process_one(command: str, log: str, options: Options, outputs: MakeOutputs, made: str) -> int:
     """Processes one recording for a command, says what was made, and returns the command's exit code."""
     viewers(options.visualize, options.rerun)  # an error now, not after the first scans
+    if options.rerun is not None:
+        check_other("--rerun", options.rerun, log)
     make_stream = options.make_stream()
 
     def all_outputs(seconds: float) -> Mapping[str, Output]:
