@@ -137,14 +137,14 @@ def check_output(output: str, log: str) -> None:
         raise TorchCRFScanError(
             f"--output: expected a file to write, got {output!r}, {'a folder' if path.is_dir() else 'a device or pipe'}"
         )
-    check_other(output, log)
+    check_other("--output", output, log)
 
 
-def check_other(output: str, log: str) -> None:
-    """Raises ValueError for an output that would replace the log that it is made of."""
+def check_other(option: str, output: str | Path, log: str | Path) -> None:
+    """Raises ValueError for an output, as an option tells it, that would replace the log that it is made of."""
     path = Path(output)
     if path.exists() and Path(log).exists() and path.samefile(log):
-        raise TorchCRFScanError(f"--output: expected another file than the log, got {output}")
+        raise TorchCRFScanError(f"{option}: expected another file than the log, got {output}")
 
 
 def batches(items: Sequence[Item]) -> Iterator[Sequence[Item]]:

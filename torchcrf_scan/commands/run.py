@@ -82,10 +82,11 @@ def _outputs(
     from torchcrf_scan.viz.movie import can_write_mp4
 
     make_folder("--output", folder)
-    for name in ("poses.tum", "tracks.csv", "summary.png", "movie.mp4", "movie.gif"):
-        check_other(str(folder / name), str(log))
+    cleaned = [clean_name(log)] if clean else []
+    for name in ("poses.tum", "tracks.csv", "summary.png", "movie.mp4", "movie.gif", *cleaned):
+        check_other("--output", folder / name, log)
     if options.rerun is not None:
-        check_other(options.rerun, str(log))
+        check_other("--rerun", options.rerun, log)
     movie = folder / ("movie.mp4" if can_write_mp4() else "movie.gif")
     outputs: dict[str, Output] = {
         "poses.tum": poses_file(folder / "poses.tum"),
@@ -94,9 +95,7 @@ def _outputs(
         movie.name: Apart(movie_file, movie, seconds, speed, is_in_world),
         **viewers(options.visualize, options.rerun),
     }
-    if clean:
-        outputs["--clean"] = writing_clean(log, folder / clean_name(log), options.reading)
-    return outputs
+    return outputs | {"--clean": writing_clean(log, folder / name, options.reading) for name in cleaned}
 
 
 def _run_one(
