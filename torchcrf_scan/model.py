@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torchcrf_scan.adjoint import layer as adjoint
 from torchcrf_scan.adjoint.layer import Unrolled
-from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch, batches
 from torchcrf_scan.choices import STARTS
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.encoder.encoder import ScanEncoder
@@ -359,10 +359,8 @@ class JointScanCRF(nn.Module):
         self, pairs: Sequence[ScanPair], batch_size: int = 16, *, outlier_distance: float | None = None
     ) -> list[PairPrediction]:
         """Predictions of many pairs, in batches of `batch_size`. outlier_distance: metres, as in `forward`."""
-        found: list[PairPrediction] = []
-        for begin in range(0, len(pairs), batch_size):
-            found += self._match(pairs[begin : begin + batch_size], outlier_distance=outlier_distance)
-        return found
+        parts = batches(pairs, batch_size)
+        return [answer for part in parts for answer in self._match(part, outlier_distance=outlier_distance)]
 
     @torch.no_grad()
     def trace_pairs(self, pairs: Sequence[ScanPair], batch_size: int = 16) -> list[tuple[PairPrediction, SearchTrace]]:
@@ -372,9 +370,9 @@ class JointScanCRF(nn.Module):
             ValueError: settings or a device for which the loops do not answer (`inference.backend`).
         """
         found: list[tuple[PairPrediction, SearchTrace]] = []
-        for begin in range(0, len(pairs), batch_size):
+        for part in batches(pairs, batch_size):
             record: list[SearchTrace] = []
-            found += zip(self._match(pairs[begin : begin + batch_size], record=record), record, strict=True)
+            found += zip(self._match(part, record=record), record, strict=True)
         return found
 
     def _match(

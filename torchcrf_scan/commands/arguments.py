@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
@@ -19,8 +19,6 @@ from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.safe_names import one_line
 from torchcrf_scan.scan import ScanPair
-
-Item = TypeVar("Item")
 
 BATCH = 16  # pairs matched at once
 
@@ -145,9 +143,3 @@ def check_other(option: str, output: str | Path, log: str | Path) -> None:
     path = Path(output)
     if path.exists() and Path(log).exists() and path.samefile(log):
         raise TorchCRFScanError(f"{option}: expected another file than the log, got {output}")
-
-
-def batches(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
-    """The items in their order, `BATCH` at a time."""
-    for begin in range(0, len(items), BATCH):
-        yield items[begin : begin + BATCH]

@@ -13,8 +13,9 @@ from tqdm import tqdm
 
 from torchcrf_scan.baselines.register import by_command
 from torchcrf_scan.baselines.start import match_start, match_static
+from torchcrf_scan.batch import batches
 from torchcrf_scan.commands import frames
-from torchcrf_scan.commands.arguments import batches, find_files, load_model
+from torchcrf_scan.commands.arguments import BATCH, find_files, load_model
 from torchcrf_scan.commands.causes import check as check_causes
 from torchcrf_scan.commands.causes import explain
 from torchcrf_scan.commands.frames import FrameOffset, Turn, match_displaced
@@ -214,7 +215,7 @@ def _run(name: str, load: Loader, pairs: Sequence[ScanPair], displacement: Frame
 def _in_batches(method: Callable[[Sequence[Item]], list[PairPrediction]], items: Sequence[Item]) -> list[PairPrediction]:
     found: list[PairPrediction] = []
     with tqdm(total=len(items), unit="pair", disable=None) as bar:
-        for part in batches(items):
+        for part in batches(items, BATCH):
             found += method(part)
             bar.update(len(part))
     return found

@@ -82,8 +82,8 @@ def _outputs(
     from torchcrf_scan.viz.movie import can_write_mp4
 
     make_folder("--output", folder)
-    cleaned = [clean_name(log)] if clean else []
-    for name in ("poses.tum", "tracks.csv", "summary.png", "movie.mp4", "movie.gif", *cleaned):
+    names = ("poses.tum", "tracks.csv", "summary.png", "movie.mp4", "movie.gif")
+    for name in (*names, clean_name(log)) if clean else names:
         check_other("--output", folder / name, log)
     if options.rerun is not None:
         check_other("--rerun", options.rerun, log)
@@ -95,7 +95,9 @@ def _outputs(
         movie.name: Apart(movie_file, movie, seconds, speed, is_in_world),
         **viewers(options.visualize, options.rerun),
     }
-    return outputs | {"--clean": writing_clean(log, folder / name, options.reading) for name in cleaned}
+    if clean:
+        outputs["--clean"] = writing_clean(log, folder / clean_name(log), options.reading)
+    return outputs
 
 
 def _run_one(
