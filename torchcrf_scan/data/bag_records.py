@@ -7,7 +7,7 @@ import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol
 
 from torchcrf_scan.data.limits import MOST_CHUNK
 from torchcrf_scan.errors import TorchCRFScanError
@@ -58,6 +58,14 @@ class Bag(Protocol):
 
     def messages(self, names: Collection[str]) -> Iterator[Message]:
         """The messages of some topics as recorded; raises ValueError, with its offset, at a fault, after all before it."""
+
+
+def read_exactly(file: BinaryIO, size: int) -> bytes:
+    """The next `size` bytes; raises EOFError if there are fewer."""
+    data = file.read(size)
+    if len(data) != size:
+        raise EOFError(f"{len(data)} of {size} bytes")
+    return data
 
 
 def unpack(data: bytes, compression: str, size: int) -> bytes:

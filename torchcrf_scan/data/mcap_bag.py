@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, type_name, unpack
+from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, read_exactly, type_name, unpack
 from torchcrf_scan.data.limits import MOST_CHUNK
 from torchcrf_scan.errors import TorchCRFScanError
 
@@ -117,11 +117,11 @@ def _read_message(kind: int, data: bytes, found: _Channels, offset: int) -> Iter
 
 
 def _read_record(file: BinaryIO) -> tuple[int, bytes]:
-    head = _exactly(file, 9)
+    head = read_exactly(file, 9)
     size = int(struct.unpack("<Q", head[1:])[0])
     if size > MOST_CHUNK:
         raise TorchCRFScanError(f"expected records of at most {MOST_CHUNK} bytes, got {size}")
-    return head[0], _exactly(file, size)
+    return head[0], read_exactly(file, size)
 
 
 def _unpack(data: bytes) -> bytes:
@@ -131,16 +131,9 @@ def _unpack(data: bytes) -> bytes:
     file.seek(28)
     compression = _string(file)
     (length,) = struct.unpack("<Q", file.read(8))
-    return unpack(_exactly(file, length), compression, size)
+    return unpack(read_exactly(file, length), compression, size)
 
 
 def _string(file: BinaryIO) -> str:
-    (size,) = struct.unpack("<I", _exactly(file, 4))
-    return _exactly(file, size).decode(errors="replace")
-
-
-def _exactly(file: BinaryIO, size: int) -> bytes:
-    data = file.read(size)
-    if len(data) != size:
-        raise EOFError(f"{len(data)} of {size} bytes")
-    return data
+    (size,) = struct.unpack("<I", read_exactly(file, 4))
+    return read_exactly(file, size).decode(errors="replace")

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, type_name, unpack
+from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, read_exactly, type_name, unpack
 from torchcrf_scan.data.limits import MOST_CHUNK
 from torchcrf_scan.errors import TorchCRFScanError
 
@@ -125,17 +125,10 @@ def _read_record(file: BinaryIO) -> tuple[Fields, bytes]:
 
 def _sized(file: BinaryIO) -> bytes:
     """Bytes behind their number."""
-    (size,) = struct.unpack("<L", _exactly(file, 4))
+    (size,) = struct.unpack("<L", read_exactly(file, 4))
     if size > MOST_CHUNK:
         raise TorchCRFScanError(f"expected at most {MOST_CHUNK} bytes, got {size}")
-    return _exactly(file, size)
-
-
-def _exactly(file: BinaryIO, size: int) -> bytes:
-    data = file.read(size)
-    if len(data) != size:
-        raise EOFError(f"{len(data)} of {size} bytes")
-    return data
+    return read_exactly(file, size)
 
 
 def _fields(data: bytes) -> Fields:
