@@ -63,7 +63,8 @@ def annotate(
         from torchcrf_scan.annotate.server import ADDRESS, make_server, serve
     except ImportError as error:
         raise TorchCRFScanError(f"annotate: expected bokeh (pip install torchcrf-scan[annotate]), got {error}") from error
-    failures, left_out = list[str](), LeftOut()
+    failures: list[str] = []
+    left_out = LeftOut()
     places = find_pairs(files, every, failures, ReadOptions(topic, odometry, no_return, left_out.add))
     store = Store(make_folder("--output", output))
     _check(port, outlier_distance, places, store)

@@ -79,6 +79,20 @@ def find_files(patterns: Sequence[str]) -> list[Path]:
     return [place.path for place in _each_once(PairPlace(path) for path in PairFiles(*patterns).paths)]
 
 
+def annotated_pairs(patterns: Sequence[str]) -> dict[Path, ScanPair]:
+    """The pairs of the matching pair files; raises TorchCRFScanError for a log, or a pair without annotation."""
+    files = find_files(patterns)
+    for path in files:
+        form = find_format(path)
+        if form is not None and form is not PAIR:
+            raise TorchCRFScanError(f"{path}: expected an annotated pair file (.npz), got a {form.name}, which has no annotation")
+    pairs = {path: read_pair(path) for path in files}
+    for path, pair in pairs.items():
+        if pair.annotation is None:
+            raise TorchCRFScanError(f"{path}: expected an annotated pair (keys association and cluster), got one without")
+    return pairs
+
+
 def find_pairs(patterns: Sequence[str], every: int, failures: list[str], options: ReadOptions = AS_RECORDED) -> list[PairPlace]:
     """The pairs of the matching files, each once, of logs every N-th; raises ValueError for two of the same name.
 
@@ -107,6 +121,7 @@ def read_one(file: str, number: int | None, options: ReadOptions = AS_RECORDED) 
     if find_format(file) is PAIR:
         if number is not None:
             raise TorchCRFScanError(f"--number: expected none but with a log, got {number} with {file}")
+        PAIR.check(file, options)
         return read_pair(file)
     log = read_recording(file, options)
     if number is None or not 0 <= number < len(log):

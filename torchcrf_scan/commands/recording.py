@@ -16,7 +16,7 @@ from tqdm import tqdm
 from torchcrf_scan.commands.arguments import check_other, load_model
 from torchcrf_scan.commands.failures import LeftOut
 from torchcrf_scan.commands.outputs import Add, Output, Outputs, viewers
-from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
+from torchcrf_scan.commands.stopping import Stopping
 from torchcrf_scan.data.formats import read_scans
 from torchcrf_scan.data.options import AUTO, ReadOptions
 from torchcrf_scan.data.reading import Reading
@@ -112,14 +112,13 @@ class Report:
 
     Attributes:
         tally: counts of its results. left_out: scans and messages that are none.
-        failures: what went wrong, one line each. rate: scans a second, until all is written. is_interrupted: Ctrl-C ended it.
+        failures: what went wrong, one line each. rate: scans a second, until all is written.
     """
 
     tally: Tally = field(default_factory=Tally)
     left_out: LeftOut = field(default_factory=LeftOut)
     failures: list[str] = field(default_factory=list)
     rate: float = 0.0
-    is_interrupted: bool = False
 
     def describe(self) -> str:
         """One line."""
@@ -187,7 +186,6 @@ def process(
             _feed(stream, reading, options, add, report)
             bar.update()
             if stopping.is_asked:
-                report.is_interrupted = True
                 break
     report.rate = report.tally.scans / (perf_counter() - begin)
     return report
@@ -226,4 +224,4 @@ def process_one(command: str, log: str, options: Options, outputs: MakeOutputs, 
     print(f"{log}: {report.describe()}; {made}")
     for failure in report.failures:
         print(f"torchcrf-scan {command}: error: {failure}", file=sys.stderr)
-    return INTERRUPTED if report.is_interrupted else 1 if report.failures else 0
+    return stopping.code or (1 if report.failures else 0)

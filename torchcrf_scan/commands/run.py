@@ -12,7 +12,7 @@ from torchcrf_scan.commands.apart import Apart
 from torchcrf_scan.commands.arguments import check_other
 from torchcrf_scan.commands.outputs import Output, check_speed, movie_file, poses_file, summary_picture, tracks_file, viewers
 from torchcrf_scan.commands.recording import DEFAULTS, MakeOutputs, Options, Stream, process
-from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
+from torchcrf_scan.commands.stopping import Stopping
 from torchcrf_scan.data.clean_log import clean_name, writing_clean
 from torchcrf_scan.data.recording import log_name
 from torchcrf_scan.errors import TorchCRFScanError
@@ -62,7 +62,7 @@ def run(
         is_first = ranks.is_first
     for failure in everyone if is_first else []:
         print(f"torchcrf-scan run: error: {failure}", file=sys.stderr)
-    return INTERRUPTED if stopping.is_asked else 1 if everyone else 0
+    return stopping.code or (1 if everyone else 0)
 
 
 def _folders(logs: Sequence[str], output: Path) -> dict[str, Path]:
