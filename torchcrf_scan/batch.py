@@ -141,7 +141,7 @@ class ScanPairBatch:
         """Pads pairs into one batch, each scan to at least one (masked) point; `truth` is set if every pair is annotated.
 
         Raises:
-            ValueError: no pairs, or a number that overflows the dtype or is beyond what a sensor gives.
+            TorchCRFScanError: no pairs, or a number that overflows the dtype or is beyond what a sensor gives.
         """
         if not pairs:
             raise TorchCRFScanError("pairs: expected at least one pair, got none")
@@ -173,7 +173,7 @@ def batches(items: Sequence[Item], batch_size: int) -> Iterator[Sequence[Item]]:
 
 
 def finite(name: str, values: Tensor, most: float = FARTHEST) -> Tensor:
-    """The values, unchanged; raises ValueError if one is not finite, e.g. after overflow of a dtype, or beyond `most`."""
+    """The values, unchanged; raises TorchCRFScanError if one is not finite, e.g. after overflow of a dtype, or beyond `most`."""
     wrong = values[~(values.double().abs() <= most)]  # half precision does not hold `most`
     if len(wrong):
         raise TorchCRFScanError(f"{name}: expected numbers of {values.dtype} within {most:g}, got {wrong[0].item()}")

@@ -181,7 +181,7 @@ class JointScanCRF(nn.Module):
         return Embeddings.of(source, target, (batch.source_mask, batch.target_mask), kind, weights)
 
     def _check(self, batch: ScanPairBatch, start: Start | None = None) -> None:
-        """Raises ValueError unless batch and start fit each other in shape, and the model in dtype and device."""
+        """Raises TorchCRFScanError unless batch and start fit each other in shape, and the model in dtype and device."""
         check_batch(batch, self.association_weights["sequence"])
         if start is not None:
             check_start(start, batch)
@@ -220,7 +220,7 @@ class JointScanCRF(nn.Module):
                 have a gradient, computed by the rounds in tensors.
 
         Raises:
-            ValueError: an input whose shape, dtype or device does not fit the batch or the model, or that it does not take.
+            TorchCRFScanError: an input whose shape, dtype or device does not fit the batch or the model, or that it does not take.
         """
         start = start or self.initialise(batch)  # InitialiseRT
         learned = self.learned_inputs(  # of the encoder and of the caller
@@ -315,7 +315,7 @@ class JointScanCRF(nn.Module):
             source_embedding, target_embedding, extra_log_unary: as in `forward`.
 
         Raises:
-            ValueError: no annotation, or an input that does not fit as in `forward`.
+            TorchCRFScanError: no annotation, or an input that does not fit as in `forward`.
         """
         if batch.truth is None:
             raise TorchCRFScanError("batch.truth: expected annotated pairs, got a batch without truth")
@@ -367,7 +367,7 @@ class JointScanCRF(nn.Module):
         """Predictions as those of `match_pairs`, each with what became of the search's hypotheses.
 
         Raises:
-            ValueError: settings or a device for which the loops do not answer (`inference.backend`).
+            TorchCRFScanError: settings or a device for which the loops do not answer (`inference.backend`).
         """
         found: list[tuple[PairPrediction, SearchTrace]] = []
         for part in batches(pairs, batch_size):
@@ -426,7 +426,7 @@ class JointScanCRF(nn.Module):
             inference: fields of `InferenceConfig` to change, e.g. `candidates=0`, `backend="eager"`.
 
         Raises:
-            ValueError: no such model, a damaged one, weights that are not finite, or a value that is out of bounds.
+            TorchCRFScanError: no such model, a damaged one, weights that are not finite, or a value that is out of bounds.
         """
         folder = find_weights(name_or_path)
         model = cls(read_config(folder, features or {}, inference))

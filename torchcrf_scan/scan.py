@@ -94,8 +94,8 @@ class Scan:
             times: (N,) seconds of every beam, instead; those after the first beam are kept.
 
         Raises:
-            ValueError: wrong shapes, neither or both forms of bearings or of times, bearings that are not finite or span more
-                than a turn, impossible limits.
+            TorchCRFScanError: wrong shapes, neither or both forms of bearings or of times, bearings that are not finite or span
+                more than a turn, impossible limits.
         """
         ranges = vector("ranges", ranges)
         range_min, range_max, range_noise = check_sensor(range_min, range_max, range_noise)

@@ -95,7 +95,7 @@ def write_whole(path: Path, content: bytes | str) -> None:
 
 
 def make_folder(option: str, folder: str | Path) -> Path:
-    """Creates a folder if necessary; raises ValueError, with the name of its option, for one that cannot be."""
+    """Creates a folder if necessary; raises TorchCRFScanError, with the name of its option, for one that cannot be."""
     if not str(folder):
         raise TorchCRFScanError(f"{option}: expected a folder, got an empty name")
     try:

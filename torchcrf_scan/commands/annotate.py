@@ -85,7 +85,7 @@ def annotate(
 
 
 def _check(port: int, outlier_distance: float | None, places: list[PairPlace], store: Store) -> None:
-    """Raises ValueError for a port or a distance that cannot be, or if an annotation would replace a file that it is made of."""
+    """Raises TorchCRFScanError for an impossible port or distance, or if an annotation would replace a file that it is made of."""
     if not 0 <= port < 1 << 16:
         raise TorchCRFScanError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
     if outlier_distance is not None and not 0 < outlier_distance < float("inf"):

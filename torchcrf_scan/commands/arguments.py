@@ -30,7 +30,7 @@ def load_model(
     threads: int | None = None,
     outlier_distance: float | None = None,
 ) -> JointScanCRF:
-    """A saved model on a device; raises ValueError for a damaged one, a missing device or an invalid number of threads.
+    """A saved model on a device; raises TorchCRFScanError for a damaged one, a missing device or an invalid number of threads.
 
     candidates, outlier_distance: of `InferenceConfig`; None: as saved.
     """
@@ -75,7 +75,7 @@ class PairPlace:
 
 
 def find_files(patterns: Sequence[str]) -> list[Path]:
-    """The matching files, each once; raises ValueError for two of the same name, as predictions are named like their pairs."""
+    """The matching files, each once; raises TorchCRFScanError for two of one name, as predictions are named like their pairs."""
     return [place.path for place in _each_once(PairPlace(path) for path in PairFiles(*patterns).paths)]
 
 
@@ -94,7 +94,7 @@ def annotated_pairs(patterns: Sequence[str]) -> dict[Path, ScanPair]:
 
 
 def find_pairs(patterns: Sequence[str], every: int, failures: list[str], options: ReadOptions = AS_RECORDED) -> list[PairPlace]:
-    """The pairs of the matching files, each once, of logs every N-th; raises ValueError for two of the same name.
+    """The pairs of the matching files, each once, of logs every N-th; raises TorchCRFScanError for two of the same name.
 
     A log that cannot be read contributes none, one that is damaged those before the fault; the reason is added to `failures`.
     """
@@ -144,7 +144,7 @@ def listed(values: tuple[str, ...] | str) -> tuple[str, ...]:
 
 
 def check_output(output: str, log: str) -> None:
-    """Raises ValueError for an output that is a folder, or would replace the log that it is made of."""
+    """Raises TorchCRFScanError for an output that is a folder, or would replace the log that it is made of."""
     path = Path(output)
     if path.exists() and not path.is_file():
         raise TorchCRFScanError(
@@ -154,7 +154,7 @@ def check_output(output: str, log: str) -> None:
 
 
 def check_other(option: str, output: str | Path, log: str | Path) -> None:
-    """Raises ValueError for an output, as an option tells it, that would replace the log that it is made of."""
+    """Raises TorchCRFScanError for an output, as an option tells it, that would replace the log that it is made of."""
     path = Path(output)
     if path.exists() and Path(log).exists() and path.samefile(log):
         raise TorchCRFScanError(f"{option}: expected another file than the log, got {output}")

@@ -35,7 +35,7 @@ class Traced:
 
 
 def check(output: str | None, worst: int, causes: bool) -> None:
-    """Raises ValueError for options that need `--causes`."""
+    """Raises TorchCRFScanError for options that need `--causes`."""
     if not causes and output is not None:
         raise TorchCRFScanError(f"--output: expected none without --causes, got {output}")
     if worst < 0:
@@ -43,7 +43,7 @@ def check(output: str | None, worst: int, causes: bool) -> None:
 
 
 def trace(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Traced:
-    """The answers of a model with the traces of its search; raises ValueError for a model that cannot be traced."""
+    """The answers of a model with the traces of its search; raises TorchCRFScanError for a model that cannot be traced."""
     from torchcrf_scan.evaluation.metrics import score_pairs
 
     found = [both for part in batches(pairs, BATCH) for both in model.trace_pairs(part)]

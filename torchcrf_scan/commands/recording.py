@@ -98,7 +98,7 @@ class Options:
         return self.use_odometry or self.odometry is not None
 
     def make_stream(self) -> Callable[[], Stream]:
-        """A maker of streams that share one model; raises ValueError for a model or device that is not there."""
+        """A maker of streams that share one model; raises TorchCRFScanError for a model or device that is not there."""
         model = load_model(self.model, None, self.device, self.threads, self.outlier_distance)
         return lambda: ScanStream(model)
 
@@ -165,7 +165,7 @@ def process(
         position: line of the progress bar.
 
     Raises:
-        ValueError: a recording without a scan; then there are no outputs.
+        TorchCRFScanError: a recording without a scan; then there are no outputs.
     """
     report, told = Report(), options.reading
     topic, odometry, no_return = told.topic, told.odometry, told.no_return

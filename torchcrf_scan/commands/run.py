@@ -66,7 +66,7 @@ def run(
 
 
 def _folders(logs: Sequence[str], output: Path) -> dict[str, Path]:
-    """The folder of every log; raises ValueError for two logs of the same name."""
+    """The folder of every log; raises TorchCRFScanError for two logs of the same name."""
     if len(logs) == 1:
         return {logs[0]: output}
     folders = {log: output / log_name(Path(log)) for log in logs}

@@ -57,7 +57,7 @@ class Bag(Protocol):
         """The topics, in the order in which they were found."""
 
     def messages(self, names: Collection[str]) -> Iterator[Message]:
-        """The messages of some topics as recorded; raises ValueError, with its offset, at a fault, after all before it."""
+        """The messages of some topics as recorded; raises TorchCRFScanError, with its offset, at a fault, after all before it."""
 
 
 def read_exactly(file: BinaryIO, size: int) -> bytes:
@@ -69,7 +69,7 @@ def read_exactly(file: BinaryIO, size: int) -> bytes:
 
 
 def unpack(data: bytes, compression: str, size: int) -> bytes:
-    """Unpacks a chunk of a stated size; raises ValueError if it is beyond the limit, or not of that size."""
+    """Unpacks a chunk of a stated size; raises TorchCRFScanError if it is beyond the limit, or not of that size."""
     if size > MOST_CHUNK:
         raise TorchCRFScanError(f"expected chunks of at most {MOST_CHUNK} bytes, got one of {size}")
     if compression in ("", "none"):
@@ -84,7 +84,7 @@ def unpack(data: bytes, compression: str, size: int) -> bytes:
 
 
 def unpack_message(data: bytes) -> bytes:
-    """Unpacks a message packed by zstd; raises ValueError if it is damaged, or beyond the limit."""
+    """Unpacks a message packed by zstd; raises TorchCRFScanError if it is damaged, or beyond the limit."""
     decompressor = _zstd()
     unpacked = _decompress(decompressor, data, MOST_CHUNK)
     if not decompressor.eof:

@@ -41,7 +41,7 @@ def writing_clean_bag(source: Path, target: Path, topic: str | None = None) -> I
         topic: of the scans; None: the only one.
 
     Raises:
-        ValueError: a bag that rosbags cannot read, or a result that does not belong to it.
+        TorchCRFScanError: a bag that rosbags cannot read, or a result that does not belong to it.
     """
     from rosbags.highlevel import AnyReader
 

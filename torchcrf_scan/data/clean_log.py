@@ -22,7 +22,7 @@ def clean_name(source: Path) -> str:
     """The name of the clean recording of a source: a log, a bag, or a folder of ROS 2.
 
     Raises:
-        ValueError: a format that is not written.
+        TorchCRFScanError: a format that is not written.
     """
     form = find_format(source)
     if form is not None and form.name == TEXT:

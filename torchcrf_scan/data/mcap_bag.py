@@ -27,7 +27,7 @@ class McapBag:
         self.path = path
 
     def topics(self) -> list[Topic]:
-        """The topics by the file's summary, or by its records if it has none; raises ValueError if none of them is whole."""
+        """The topics by the file's summary, or by its records if it has none; raises TorchCRFScanError if none of them is whole."""
         found = _Channels()
         with open(self.path, "rb") as file:
             for start in (self._summary(file), len(MAGIC)):
@@ -58,7 +58,7 @@ class McapBag:
         """The messages of some topics in the order of the file.
 
         Raises:
-            ValueError: a damaged or cut record, with its offset, after all messages before it.
+            TorchCRFScanError: a damaged or cut record, with its offset, after all messages before it.
         """
         with open(self.path, "rb") as file:
             try:

@@ -38,7 +38,7 @@ class Recording(Sequence[ScanPair]):
         fault: what ended the reading before the end of the file; None: nothing.
 
     Raises:
-        ValueError: fewer than two scans, or a name with control characters.
+        TorchCRFScanError: fewer than two scans, or a name with control characters.
     """
 
     def __init__(self, path: str | Path, read: Read, again: Read | None = None) -> None:

@@ -28,7 +28,7 @@ class Ros1Bag:
         self.path = path
 
     def topics(self) -> list[Topic]:
-        """The topics by the bag's index, or by its records if it has none; raises ValueError if none of them is whole."""
+        """The topics by the bag's index, or by its records if it has none; raises TorchCRFScanError if none of them is whole."""
         connections: dict[int, Topic] = {}
         with open(self.path, "rb") as file:
             try:
@@ -62,7 +62,7 @@ class Ros1Bag:
         """The messages of some topics in the order of the file.
 
         Raises:
-            ValueError: a damaged or cut record, with its offset, after all messages before it.
+            TorchCRFScanError: a damaged or cut record, with its offset, after all messages before it.
         """
         connections: dict[int, Topic] = {}
         with open(self.path, "rb") as file:

@@ -51,7 +51,7 @@ def laser_scan(message: Any, no_return: float) -> Scan:
 
 
 def cloud_scan(message: Any, no_return: float) -> Scan:
-    """The scan of a planar PointCloud2, a beam for every point; raises ValueError for one that is not planar.
+    """The scan of a planar PointCloud2, a beam for every point; raises TorchCRFScanError for one that is not planar.
 
     no_return: metres; points from there on are beams without return.
     """

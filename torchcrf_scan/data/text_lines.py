@@ -39,7 +39,7 @@ def read_lines(path: Path) -> Iterator[Line]:
     """The lines of a text file, one at a time.
 
     Raises:
-        ValueError: after the last whole line, where the file is damaged, cut, binary, or has a line beyond `MOST_LINE`.
+        TorchCRFScanError: after the last whole line, where the file is damaged, cut, binary, or has a line beyond `MOST_LINE`.
         OSError: it cannot be opened.
     """
     number, offset = 1, 0

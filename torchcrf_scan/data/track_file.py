@@ -76,7 +76,7 @@ def read_tracks(path: str | Path) -> TrackTable:
     """Reads a file of tracks. Further columns are ignored.
 
     Raises:
-        ValueError: a missing column, a line that is too short, or a field that is not a number; names file and line.
+        TorchCRFScanError: a missing column, a line that is too short, or a field that is not a number; names file and line.
         OSError: the file cannot be opened.
     """
     try:
