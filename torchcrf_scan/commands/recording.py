@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
 from time import perf_counter
-from typing import Protocol
 
 import numpy as np
 from tqdm import tqdm
@@ -23,9 +22,8 @@ from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.recording import log_name
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED
-from torchcrf_scan.result import ScanResult
+from torchcrf_scan.result import Stream
 from torchcrf_scan.safe_names import one_line
-from torchcrf_scan.scan import Floats, Scan
 from torchcrf_scan.stream.clock import Clock
 from torchcrf_scan.stream.stream import ScanStream
 from torchcrf_scan.viz.history import Tally
@@ -35,13 +33,6 @@ MakeOutputs = Callable[[float], Mapping[str, Output]]  # of the seconds between 
 LOOK_AHEAD = 21  # readings from whose stamps the time between scans is found
 ROUNDING = 1e-6  # seconds; stamps have no more digits
 SECONDS = (0.005, 5.0)  # between scans, plausible ones
-
-
-class Stream(Protocol):
-    """What makes results of scans."""
-
-    def feed(self, scan: Scan, stamp: float, odometry: Floats | None = None) -> ScanResult:
-        """What is known after one more scan."""
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,13 @@ from typing import Literal
 from torchcrf_scan.commands.apart import Apart
 from torchcrf_scan.commands.arguments import check_other
 from torchcrf_scan.commands.outputs import Output, check_speed, movie_file, poses_file, summary_picture, tracks_file, viewers
-from torchcrf_scan.commands.recording import DEFAULTS, MakeOutputs, Options, Stream, process
+from torchcrf_scan.commands.recording import DEFAULTS, MakeOutputs, Options, process
 from torchcrf_scan.commands.stopping import Stopping
 from torchcrf_scan.data.clean_log import clean_name, writing_clean
 from torchcrf_scan.data.recording import log_name
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.learning.ranks import join
+from torchcrf_scan.result import Stream
 from torchcrf_scan.safe_names import one_line
 from torchcrf_scan.whole_file import make_folder
 
