@@ -19,11 +19,11 @@ import os
 import sys
 from collections.abc import Sequence
 
-from torchcrf_scan.commands.failures import one_line
 from torchcrf_scan.commands.parser import CommandParser
 from torchcrf_scan.evaluation.report import report
 from torchcrf_scan.experiment.parser import config_of, settings_parser
 from torchcrf_scan.learning.trainer import train
+from torchcrf_scan.safe_names import one_line
 
 
 def main(argv: Sequence[str] | None = None) -> int:

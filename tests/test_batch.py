@@ -331,9 +331,6 @@ def test_a_guess_of_the_motion_comes_along() -> None:
     scan = Scan.from_ranges(np.full(5, 2.0), np.linspace(-1.0, 1.0, 5))
     pairs = [ScanPair(scan, scan), ScanPair(scan, scan, initial_motion=np.array([0.1, 1.0, -2.0]))]
     assert_close(ScanPairBatch.collate(pairs, torch.float64).initial_motion, [[0.0, 0.0, 0.0], [0.1, 1.0, -2.0]])
-    for wrong in (np.zeros(2), np.array([0.0, np.nan, 0.0])):
-        with pytest.raises(ValueError, match="initial_motion: expected three finite numbers"):
-            ScanPairBatch.collate([ScanPair(scan, scan, initial_motion=wrong)])
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32])

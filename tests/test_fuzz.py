@@ -66,11 +66,11 @@ def test_returns_in_one_direction_have_a_finite_answer(ranges: list[float]) -> N
 @given(st.lists(st.floats(-1e30, 1e30) | number, min_size=3, max_size=20))
 def test_a_scan_made_by_hand_is_checked_too(values: list[float]) -> None:
     points = np.array(values)
-    scan = Scan(points, np.linspace(-1, 1, len(points)), np.arange(len(points)), len(points))
     try:
+        scan = Scan(points, np.linspace(-1, 1, len(points)), np.arange(len(points)), len(points))
         assert_finite(model().match(scan, scan))
     except TorchCRFScanError as error:
-        assert "within 1e+06" in str(error)  # noqa: PT017
+        assert "within 1e+06" in str(error) or str(error).startswith("ranges: expected finite numbers")  # noqa: PT017
 
 
 anything = st.recursive(

@@ -23,6 +23,7 @@ from torchcrf_scan import (
 )
 from torchcrf_scan.data.simulate import simulate_pairs
 from torchcrf_scan.data.worlds import SimulatorConfig
+from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start, beyond_reach
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
@@ -266,6 +267,9 @@ def test_one_pair_is_matched_like_many(pairs: list[ScanPair]) -> None:
 
 def test_no_pair_has_no_answer() -> None:
     assert JointScanCRF().match_pairs([]) == []
+    for wrong in (0, -1):
+        with pytest.raises(TorchCRFScanError, match=f"batch_size: expected at least 1, got {wrong}"):
+            JointScanCRF().match_pairs([], batch_size=wrong)
 
 
 def test_answers_are_by_beam(pairs: list[ScanPair]) -> None:

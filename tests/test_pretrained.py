@@ -198,7 +198,7 @@ def test_weights_that_are_none_are_refused(content: bytes | None, saved: Path) -
 def test_files_longer_than_a_models_are_not_read(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, limit in ((WEIGHTS, "MOST_WEIGHTS"), (CONFIG, "MOST_CONFIG")):
         monkeypatch.setattr(pretrained, limit, 100)
-        with pytest.raises(ValueError, match=f"{saved / name}: expected at most 100 bytes, got more"):
+        with pytest.raises(ValueError, match=f"^{saved / name}: expected at most 100 bytes, got more"):
             JointScanCRF.from_pretrained(saved)
 
 

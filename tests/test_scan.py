@@ -1,12 +1,14 @@
 import re
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchcrf_scan.scan import Scan
+from torchcrf_scan.errors import TorchCRFScanError
+from torchcrf_scan.scan import Scan, ScanPair
 
 BEARINGS = np.array([-0.2, -0.1, 0.0, 0.1, 0.2])
 
@@ -62,6 +64,10 @@ def test_an_empty_scan_is_a_scan(ranges: list[float]) -> None:
         ({"ranges": [1.0], "angle_increment": 0.1}, "bearings: expected either bearings or both"),
         ({"ranges": [1.0], "bearings": [0.0], "angle_min": 0.0, "angle_increment": 0.1}, "bearings: expected either"),
         ({"ranges": [1.0, 1.0], "bearings": [0.0, np.nan]}, "bearings: expected finite numbers, got 1 that are not"),
+        ({"ranges": [1.0], "angle_min": "a", "angle_increment": 0.1}, "angle_min: expected a number of radians, got 'a'"),
+        ({"ranges": [1.0], "bearings": [0.0], "range_min": "a"}, "range_min: expected a number of metres, got 'a'"),
+        ({"ranges": [1.0], "bearings": [0.0], "range_max": [2.0]}, r"range_max: expected a number of metres, got \[2.0\]"),
+        ({"ranges": [1.0], "bearings": [0.0], "time_increment": "a"}, "time_increment: expected a number of seconds, got 'a'"),
     ],
 )
 def test_wrong_arguments_are_named(arguments: dict, message: str) -> None:
@@ -138,3 +144,46 @@ def test_beams_that_all_go_one_way_are_refused() -> None:
     with pytest.raises(ValueError, match=r"^angle_increment: expected radians from beam to beam, got 0$"):
         Scan.from_ranges([1.0, 2.0], angle_min=0.0, angle_increment=0.0)
     assert len(Scan.from_ranges([1.0], angle_min=0.0, angle_increment=0.0)) == 1
+
+
+SCAN = Scan.from_ranges([1.0, np.nan, 3.0], [0.0, 0.1, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ranges": "a"}, "ranges: expected numbers"),
+        ({"ranges": np.array([1.0, np.nan])}, "ranges: expected finite numbers, got nan"),
+        ({"bearings": np.zeros(3)}, r"bearings: expected shape \(2,\), got \(3,\)"),
+        ({"bearings": np.array([0.2, 0.0])}, "bearings: expected radians in rising order"),
+        ({"beam": np.array([0, 3])}, "beam: expected distinct indices below n_beams = 3"),
+        ({"beam": np.array([-1, 2])}, "beam: expected distinct indices"),
+        ({"beam": np.array([2, 2])}, "beam: expected distinct indices"),
+        ({"n_beams": 3.5}, "n_beams: expected a number from 0 to 20000, got 3.5"),
+        ({"range_min": "a"}, "range_min: expected a number of metres, got 'a'"),
+        ({"times": np.array([0.0, np.inf])}, "times: expected finite numbers, got inf"),
+    ],
+)
+def test_a_scan_put_together_by_hand_is_checked(changes: dict, message: str) -> None:
+    with pytest.raises(TorchCRFScanError, match=f"^{message}"):
+        replace(SCAN, **changes)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"source": np.ones(3)}, "source: expected Scan, got ndarray"),
+        ({"target": None}, "target: expected Scan, got NoneType"),
+        ({"annotation": 3}, "annotation: expected Annotation or None, got int"),
+        ({"name": Path("pair")}, "name: expected str, got PosixPath"),
+        ({"dt": "0.1"}, "dt: expected a number of seconds, got '0.1'"),
+        ({"dt": 0.0}, "dt: expected seconds between 1e-06 and 1e\\+09, got 0.0"),
+        ({"initial_motion": "odometry"}, "initial_motion: expected numbers"),
+        ({"initial_motion": [0.0, 1.0]}, r"initial_motion: expected shape \(3,\), got \(2,\)"),
+        ({"initial_motion": [0.0, np.nan, 0.0]}, "initial_motion: expected finite numbers"),
+        ({"initial_motion": [0.0, 1e7, 0.0]}, "initial_motion: expected finite numbers .* within 1e\\+06, got"),
+    ],
+)
+def test_a_pair_is_checked(fields: dict, message: str) -> None:
+    with pytest.raises(TorchCRFScanError, match=f"^{message}"):
+        ScanPair(**{"source": SCAN, "target": SCAN} | fields)

@@ -54,3 +54,19 @@ def test_a_pipe_or_device_is_not_replaced(tmp_path: Path) -> None:
         pass
     assert (tmp_path / "pipe").is_fifo()
     assert [of.name for of in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_a_folder_takes_the_place_of_a_folder_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "precious").write_text("as it was")
+    with pytest.raises(IsADirectoryError), whole_path(folder) as path:
+        path.write_text("a file")
+    with pytest.raises(FileNotFoundError), whole_path(folder):
+        pass  # nothing is written
+    assert (folder / "precious").read_text() == "as it was"
+    with whole_path(folder) as path:
+        path.mkdir()
+        (path / "new").write_text("new")
+    assert [of.name for of in folder.iterdir()] == ["new"]
+    assert [of.name for of in tmp_path.iterdir()] == ["folder"]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +14,8 @@ from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import FARTHEST, LONGEST, Floats, Scan, ScanPair
 from torchcrf_scan.tree import tensor_tree
+
+Item = TypeVar("Item")
 
 
 @tensor_tree
@@ -138,7 +141,7 @@ class ScanPairBatch:
         """Pads pairs into one batch, each scan to at least one (masked) point; `truth` is set if every pair is annotated.
 
         Raises:
-            ValueError: no pairs, or a number that overflows the dtype or is beyond what a sensor gives.
+            TorchCRFScanError: no pairs, or a number that overflows the dtype or is beyond what a sensor gives.
         """
         if not pairs:
             raise TorchCRFScanError("pairs: expected at least one pair, got none")
@@ -161,8 +164,16 @@ class ScanPairBatch:
         )
 
 
+def batches(items: Sequence[Item], batch_size: int) -> Iterator[Sequence[Item]]:
+    """The items in their order, `batch_size` at a time; raises TorchCRFScanError for a size below 1."""
+    if batch_size < 1:
+        raise TorchCRFScanError(f"batch_size: expected at least 1, got {batch_size}")
+    for begin in range(0, len(items), batch_size):
+        yield items[begin : begin + batch_size]
+
+
 def finite(name: str, values: Tensor, most: float = FARTHEST) -> Tensor:
-    """The values, unchanged; raises ValueError if one is not finite, e.g. after overflow of a dtype, or beyond `most`."""
+    """The values, unchanged; raises TorchCRFScanError if one is not finite, e.g. after overflow of a dtype, or beyond `most`."""
     wrong = values[~(values.double().abs() <= most)]  # half precision does not hold `most`
     if len(wrong):
         raise TorchCRFScanError(f"{name}: expected numbers of {values.dtype} within {most:g}, got {wrong[0].item()}")
@@ -187,14 +198,7 @@ def _pad_points(scans: Sequence[Scan]) -> tuple[Tensor, Tensor]:
 
 def initial_motion_of(pair: ScanPair) -> Floats:
     """(3,) the pair's initial guess; the identity if it has none."""
-    if pair.initial_motion is None:
-        return np.zeros(3)
-    guess = np.asarray(pair.initial_motion, dtype=np.float64)
-    if guess.shape != (3,) or not (np.abs(guess) <= FARTHEST).all():
-        raise TorchCRFScanError(
-            f"initial_motion: expected three finite numbers (theta, tx, ty) within {FARTHEST:g}, got {guess.tolist()}"
-        )
-    return guess
+    return np.zeros(3) if pair.initial_motion is None else pair.initial_motion
 
 
 def range_noise_of(pair: ScanPair) -> float:

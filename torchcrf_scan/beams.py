@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -11,7 +13,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-NUMBERS = "biufO"  # kinds of arrays that are converted; objects one by one
+REAL = "biuf"  # kinds of arrays of real numbers
+NUMBERS = f"{REAL}O"  # that are converted; objects one by one
 
 FARTHEST = 1e6  # metres; larger ranges are treated as invalid, as their squares would lose single precision
 FARTHEST_BEARING = 4 * np.pi  # radians; a sensor's own numbers stay within two turns
@@ -39,15 +42,30 @@ def vector(name: str, values: ArrayLike, length: int | None = None) -> Floats:
     return array
 
 
-def check_sensor(range_min: float | None, range_max: float | None, range_noise: float | None) -> None:
-    """Raises ValueError for impossible sensor limits: not a number, an empty interval, or noise out of bounds."""
-    least = 0.0 if range_min is None else range_min
+def number(name: str, value: Any, unit: str) -> float:
+    """The value as a float, also if it is not finite; `unit` is for the message."""
+    array = np.asarray(value)
+    if array.ndim > 0 or array.dtype.kind not in REAL:
+        raise TorchCRFScanError(f"{name}: expected a number of {unit}, got {value!r:.80}")
+    return float(array)
+
+
+def check_sensor(
+    range_min: float | None, range_max: float | None, range_noise: float | None
+) -> tuple[float | None, float | None, float | None]:
+    """The sensor's limits as floats; raises TorchCRFScanError for no number, an empty interval, or noise out of bounds."""
+    range_min, range_max, range_noise = (
+        None if value is None else number(name, value, "metres")
+        for name, value in (("range_min", range_min), ("range_max", range_max), ("range_noise", range_noise))
+    )
+    least = range_min or 0.0
     if not np.isfinite(least):
         raise TorchCRFScanError(f"range_min: expected a finite number of metres, got {range_min}")
     if range_max is not None and not range_max > max(least, 0.0):
         raise TorchCRFScanError(f"range_max: expected more than range_min = {max(least, 0.0)}, got {range_max}")
     if range_noise is not None and not 0 <= range_noise <= FARTHEST:
         raise TorchCRFScanError(f"range_noise: expected metres between 0 and {FARTHEST:g}, got {range_noise}")
+    return range_min, range_max, range_noise
 
 
 def bearings_of(count: int, bearings: ArrayLike | None, angle_min: float | None, angle_increment: float | None) -> Floats:
@@ -58,7 +76,7 @@ def bearings_of(count: int, bearings: ArrayLike | None, angle_min: float | None,
             "bearings: expected either bearings or both angle_min and angle_increment, got neither, half or both"
         )
     if bearings is None:
-        first, increment = steps
+        first, increment = (number(name, of, "radians") for name, of in zip(("angle_min", "angle_increment"), steps, strict=True))
         if increment == 0 and count > 1:
             raise TorchCRFScanError("angle_increment: expected radians from beam to beam, got 0")
         with np.errstate(over="ignore", invalid="ignore"):
@@ -81,10 +99,10 @@ def times_of(count: int, time_increment: float | None, times: ArrayLike | None) 
     with np.errstate(over="ignore", invalid="ignore"):
         if times is not None:
             name, after = "times", vector("times", times, count)
-        elif time_increment:
-            name, after = "time_increment", time_increment * np.arange(count, dtype=np.float64)
-        else:
+        elif time_increment is None or (step := number("time_increment", time_increment, "seconds")) == 0:
             return None
+        else:
+            name, after = "time_increment", step * np.arange(count, dtype=np.float64)
         after = after - after[:1]
     wrong = after[~(np.abs(after) <= LONGEST_SWEEP)]
     if len(wrong):

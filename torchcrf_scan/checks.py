@@ -86,7 +86,7 @@ def check_fields(settings: Any, prefix: str = "") -> None:
         prefix: of the names in messages, e.g. `gradient.`.
 
     Raises:
-        ValueError: a value of another type, not finite, or out of bounds.
+        TorchCRFScanError: a value of another type, not finite, or out of bounds.
     """
     kind: Any = type(settings)
     for name, hint in _annotations(kind).items():
@@ -98,7 +98,7 @@ def from_values(kind: Callable[..., Settings], values: object, name: str) -> Set
     """Settings from a dictionary as produced by `asdict` and stored in files; missing keys take their defaults.
 
     Raises:
-        ValueError: not a dictionary, an unknown setting, or a value rejected by `check_fields`.
+        TorchCRFScanError: not a dictionary, an unknown setting, or a value rejected by `check_fields`.
     """
     if not isinstance(values, Mapping):
         raise TorchCRFScanError(f"{name}: expected settings by name, got {_shown(values)}")

@@ -1,6 +1,7 @@
 """The command `torchcrf-scan`: every subcommand is a typed function; its options and help come from signature and docstring.
 
-Exit codes: 0 done, 1 bad input (one line on stderr), 2 bad usage. Dependencies of a single command are imported there.
+Exit codes: 0 done, 1 bad input (one line on stderr), 2 bad usage, 130 Ctrl-C, 143 terminated. Dependencies of a single command
+are imported there.
 """
 
 from __future__ import annotations
@@ -69,7 +70,6 @@ FLAGS: Mapping[str, str] = {  # parameter that is true or false: help
     "open": "also open the page in the browser",
     "visualize": "show everything in the viewer of rerun while it is computed (extra `viewer`)",
 }
-
 
 SHARED = "options"  # parameter of commands that take the fields of `Options` as options
 

@@ -1,4 +1,4 @@
-"""All settings of the package as frozen dataclasses, filled from `configs/*.yaml` and the command line (jsonargparse)."""
+"""Settings of the model as frozen dataclasses, filled from `configs/*.yaml` and the command line (jsonargparse)."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ class ModelConfig:
             raise TorchCRFScanError(f"coupling: expected {two_chains} with schedule {schedule}, got {self.coupling}")
 
     def with_limit(self, outlier_distance: float | None) -> ModelConfig:
-        """The settings with this `outlier_distance`; None: the same. Raises ValueError for one that they do not take."""
+        """The settings with this `outlier_distance`; None: the same. Raises TorchCRFScanError for one that they do not take."""
         if outlier_distance is None:
             return self
         return replace(self, inference=replace(self.inference, outlier_distance=outlier_distance))
@@ -209,7 +209,7 @@ class ModelConfig:
         return {name: value for name, value in chosen.items() if not getattr(OF_ROUNDS[name][value], ability)}
 
     def require(self, ability: str, purpose: str) -> None:
-        """Raises ValueError if a variant lacks an ability that a purpose needs."""
+        """Raises TorchCRFScanError if a variant lacks an ability that a purpose needs."""
         for name, value in self.without(ability).items():
             raise TorchCRFScanError(
                 f"{name}: expected {' or '.join(with_ability(OF_ROUNDS[name], ability))} {purpose}, got {value}"

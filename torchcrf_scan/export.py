@@ -131,9 +131,8 @@ def decoder_inputs(batch: ScanPairBatch, start: Start | Tensor) -> dict[str, Ten
     else:
         of_start = {f.name: getattr(start, f.name) for f in fields(start) if getattr(start, f.name) is not None}
     of_batch = {name: getattr(batch, name) for name in FROM_BATCH}
-    return of_batch | {
-        f"start_{name}": value for name, value in of_start.items()
-    }  # names are unique within a graph, and `motions` is an output too
+    # names are unique within a graph, and `motions` is an output too
+    return of_batch | {f"start_{name}": value for name, value in of_start.items()}
 
 
 def export_program(

@@ -56,24 +56,24 @@ EXTRA: Layout = {"outlier": (("B", "N"), None), "moving": (("B", "N"), None)}
 
 
 def check_batch(batch: ScanPairBatch, weight: Tensor) -> None:
-    """Raises ValueError unless the batch's tensors fit each other, and a weight of the model in dtype and device."""
+    """Raises TorchCRFScanError unless the batch's tensors fit each other, and a weight of the model in dtype and device."""
     sizes = check_fields("batch.", batch, BATCH, {}, weight)
     if batch.truth is not None:
         check_fields("batch.truth.", batch.truth, TRUTH, sizes, weight)
 
 
 def check_start(start: Start, batch: ScanPairBatch) -> None:
-    """Raises ValueError unless the start fits the batch."""
+    """Raises TorchCRFScanError unless the start fits the batch."""
     check_fields("start.", start, START, sizes_of(batch), batch.source)
 
 
 def check_plugins(plugins: PlugIns, batch: ScanPairBatch) -> None:
-    """Raises ValueError unless the plug-ins of the pseudo-likelihood fit the batch."""
+    """Raises TorchCRFScanError unless the plug-ins of the pseudo-likelihood fit the batch."""
     check_fields("plugins.", plugins, PLUGINS, sizes_of(batch), batch.source)
 
 
 def check_inputs(batch: ScanPairBatch, extra: ExtraLogUnary, embeddings: tuple[Tensor | None, Tensor | None]) -> None:
-    """Raises ValueError unless the optional inputs of `forward` fit the batch; under autocast they may have its dtype."""
+    """Raises TorchCRFScanError unless the optional inputs of `forward` fit the batch; under autocast they may have its dtype."""
     check_fields("extra_log_unary.", extra, EXTRA, sizes_of(batch), batch.source, is_learned=True)
     for name, axis, value in zip(("source_embedding", "target_embedding"), "NM", embeddings, strict=True):
         if value is not None:
@@ -108,7 +108,7 @@ def check_tensor(
     *,
     is_learned: bool = False,
 ) -> None:
-    """Raises ValueError unless a tensor has the shape, dtype (None: that of `like`) and device expected.
+    """Raises TorchCRFScanError unless a tensor has the shape, dtype (None: that of `like`) and device expected.
 
     Args:
         axes: sizes, or names of axes; a name without an entry in `sizes` is any size.

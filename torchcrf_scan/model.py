@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torchcrf_scan.adjoint import layer as adjoint
 from torchcrf_scan.adjoint.layer import Unrolled
-from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch, batches
 from torchcrf_scan.choices import STARTS
 from torchcrf_scan.config import ModelConfig
 from torchcrf_scan.encoder.encoder import ScanEncoder
@@ -185,7 +185,7 @@ class JointScanCRF(nn.Module):
         return Embeddings.of(source, target, (batch.source_mask, batch.target_mask), kind, weights)
 
     def _check(self, batch: ScanPairBatch, start: Start | None = None) -> None:
-        """Raises ValueError unless batch and start fit each other in shape, and the model in dtype and device."""
+        """Raises TorchCRFScanError unless batch and start fit each other in shape, and the model in dtype and device."""
         check_batch(batch, self.association_weights["sequence"])
         if start is not None:
             check_start(start, batch)
@@ -224,7 +224,7 @@ class JointScanCRF(nn.Module):
                 have a gradient, computed by the rounds in tensors.
 
         Raises:
-            ValueError: an input whose shape, dtype or device does not fit the batch or the model, or that it does not take.
+            TorchCRFScanError: an input whose shape, dtype or device does not fit the batch or the model, or that it does not take.
         """
         start = start or self.initialise(batch)  # InitialiseRT
         learned = self.learned_inputs(  # of the encoder and of the caller
@@ -319,7 +319,7 @@ class JointScanCRF(nn.Module):
             source_embedding, target_embedding, extra_log_unary: as in `forward`.
 
         Raises:
-            ValueError: no annotation, or an input that does not fit as in `forward`.
+            TorchCRFScanError: no annotation, or an input that does not fit as in `forward`.
         """
         if batch.truth is None:
             raise TorchCRFScanError("batch.truth: expected annotated pairs, got a batch without truth")
@@ -363,22 +363,20 @@ class JointScanCRF(nn.Module):
         self, pairs: Sequence[ScanPair], batch_size: int = 16, *, outlier_distance: float | None = None
     ) -> list[PairPrediction]:
         """Predictions of many pairs, in batches of `batch_size`. outlier_distance: metres, as in `forward`."""
-        found: list[PairPrediction] = []
-        for begin in range(0, len(pairs), batch_size):
-            found += self._match(pairs[begin : begin + batch_size], outlier_distance=outlier_distance)
-        return found
+        parts = batches(pairs, batch_size)
+        return [answer for part in parts for answer in self._match(part, outlier_distance=outlier_distance)]
 
     @torch.no_grad()
     def trace_pairs(self, pairs: Sequence[ScanPair], batch_size: int = 16) -> list[tuple[PairPrediction, SearchTrace]]:
         """Predictions as those of `match_pairs`, each with what became of the search's hypotheses.
 
         Raises:
-            ValueError: settings or a device for which the loops do not answer (`inference.backend`).
+            TorchCRFScanError: settings or a device for which the loops do not answer (`inference.backend`).
         """
         found: list[tuple[PairPrediction, SearchTrace]] = []
-        for begin in range(0, len(pairs), batch_size):
+        for part in batches(pairs, batch_size):
             record: list[SearchTrace] = []
-            found += zip(self._match(pairs[begin : begin + batch_size], record=record), record, strict=True)
+            found += zip(self._match(part, record=record), record, strict=True)
         return found
 
     def _match(
@@ -432,7 +430,7 @@ class JointScanCRF(nn.Module):
             inference: fields of `InferenceConfig` to change, e.g. `candidates=0`, `backend="eager"`.
 
         Raises:
-            ValueError: no such model, a damaged one, weights that are not finite, or a value that is out of bounds.
+            TorchCRFScanError: no such model, a damaged one, weights that are not finite, or a value that is out of bounds.
         """
         folder = find_weights(name_or_path)
         model = cls(read_config(folder, features or {}, inference))

@@ -55,11 +55,12 @@ def read_config(folder: Path, features: Mapping[str, Any], inference: Mapping[st
     """The config of a saved model with some fields changed.
 
     Raises:
-        ValueError: a file that is not a valid config, or a value that is out of bounds.
+        TorchCRFScanError: a file that is not a valid config, or a value that is out of bounds.
     """
     path = folder / CONFIG
+    content = _bytes(path, MOST_CONFIG)
     try:
-        config = model_config(json.loads(_bytes(path, MOST_CONFIG)))
+        config = model_config(json.loads(content))
     except (ValueError, RecursionError) as error:
         raise TorchCRFScanError(f"{path}: {error}") from error
     return replace(config, inference=replace(config.inference, **inference), features=replace(config.features, **features))
@@ -91,7 +92,7 @@ def load_state(model: nn.Module, folder: Path, fresh: Mapping[str, Tensor]) -> N
     """Loads the saved tensors into a model; those missing in the file are taken from `fresh`.
 
     Raises:
-        ValueError: a damaged file, one of another model, or numbers that are not finite.
+        TorchCRFScanError: a damaged file, one of another model, or numbers that are not finite.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load
@@ -106,7 +107,7 @@ def load_state(model: nn.Module, folder: Path, fresh: Mapping[str, Tensor]) -> N
 
 
 def check_weights(where: str, weights: Mapping[str, Tensor]) -> None:
-    """Raises ValueError for the first tensor that is not finite, or beyond `LARGEST`. where: for the message."""
+    """Raises TorchCRFScanError for the first tensor that is not finite, or beyond `LARGEST`. where: for the message."""
     for name, value in weights.items():
         size = value.double().abs()
         is_right = (size <= LARGEST) | (torch.isinf(size) if name.endswith(PADDED) else False)
@@ -115,7 +116,7 @@ def check_weights(where: str, weights: Mapping[str, Tensor]) -> None:
 
 
 def _bytes(path: Path, most: int) -> bytes:
-    """The content of a file; raises ValueError for one that is longer than any model's."""
+    """The content of a file; raises TorchCRFScanError for one that is longer than any model's."""
     with path.open("rb") as file:
         content = file.read(most + 1)
     if len(content) > most:

@@ -6,7 +6,7 @@ Frame `world`: that of the first scan. A pose is `T_world_sensor` = (theta, x, y
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 from torchcrf_scan.scan import Bools, Floats, Ints, Scan
 
@@ -64,3 +64,10 @@ class ScanResult:
     objects: tuple[MovingObject, ...]
     status: Status
     reason: str
+
+
+class Stream(Protocol):
+    """What makes results of scans: `torchcrf_scan.stream.stream.ScanStream`, or anything with its `feed`."""
+
+    def feed(self, scan: Scan, stamp: float, odometry: Floats | None = None) -> ScanResult:
+        """What is known after one more scan."""

@@ -37,7 +37,7 @@ def printable(name: str) -> str:
 
 
 def check_name(where: str, name: str) -> None:
-    """Raises ValueError for a name with control characters. where: the file and the field it comes from."""
+    """Raises TorchCRFScanError for a name with control characters. where: the file and the field it comes from."""
     if printable(name) != name:
         raise TorchCRFScanError(
             f"{printable(where)}: expected a name without control characters, got {printable(name)[: 2 * LONGEST]!r}"

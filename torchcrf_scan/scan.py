@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchcrf_scan.beams import FARTHEST, Bools, Floats, Ints, bearings_of, check_sensor, times_of, vector
+from torchcrf_scan.beams import FARTHEST, MOST_BEAMS, Bools, Floats, Ints, bearings_of, check_sensor, number, times_of, vector
 from torchcrf_scan.errors import TorchCRFScanError
 
 BACKGROUND = 0
@@ -28,7 +28,7 @@ CLOSED_SPAN = float(np.radians(315.0))  # a scan that spans at least this much h
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """The valid returns of one planar laser scan, counter-clockwise.
+    """The valid returns of one planar laser scan, counter-clockwise; made by `from_ranges`.
 
     Attributes:
         ranges: (N,) metres.
@@ -37,6 +37,9 @@ class Scan:
         n_beams: length of those arrays.
         range_min, range_max, range_noise: metres, None when unknown.
         times: (N,) seconds of every return after the first beam of the input; None: unknown.
+
+    Raises:
+        TorchCRFScanError: fields that do not fit each other, or the description above.
     """
 
     ranges: Floats
@@ -47,6 +50,22 @@ class Scan:
     range_max: float | None = None
     range_noise: float | None = None
     times: Floats | None = None
+
+    def __post_init__(self) -> None:
+        check_sensor(self.range_min, self.range_max, self.range_noise)
+        if not (isinstance(self.n_beams, int | np.integer) and 0 <= self.n_beams <= MOST_BEAMS):
+            raise TorchCRFScanError(f"n_beams: expected a number from 0 to {MOST_BEAMS}, got {self.n_beams!r:.80}")
+        ranges = vector("ranges", self.ranges)
+        for name in ("ranges", "bearings", "beam") if self.times is None else ("ranges", "bearings", "beam", "times"):
+            values = vector(name, getattr(self, name), len(ranges))
+            if not np.isfinite(values).all():
+                raise TorchCRFScanError(f"{name}: expected finite numbers, got {values[~np.isfinite(values)][0]}")
+            object.__setattr__(self, name, values if name != "beam" else values.astype(np.int64))
+        if (self.bearings[1:] < self.bearings[:-1]).any():
+            raise TorchCRFScanError("bearings: expected radians in rising order, got others")
+        is_beam = self.beam.min(initial=0) >= 0 and self.beam.max(initial=-1) < self.n_beams
+        if not is_beam or np.bincount(self.beam).max(initial=0) > 1:
+            raise TorchCRFScanError(f"beam: expected distinct indices below n_beams = {self.n_beams}, got others")
 
     @classmethod
     def from_ranges(
@@ -75,11 +94,11 @@ class Scan:
             times: (N,) seconds of every beam, instead; those after the first beam are kept.
 
         Raises:
-            ValueError: wrong shapes, neither or both forms of bearings or of times, bearings that are not finite or span more
-                than a turn, impossible limits.
+            TorchCRFScanError: wrong shapes, neither or both forms of bearings or of times, bearings that are not finite or span
+                more than a turn, impossible limits.
         """
         ranges = vector("ranges", ranges)
-        check_sensor(range_min, range_max, range_noise)
+        range_min, range_max, range_noise = check_sensor(range_min, range_max, range_noise)
         bearings = bearings_of(len(ranges), bearings, angle_min, angle_increment)
         after = times_of(len(ranges), time_increment, times)
         with np.errstate(invalid="ignore"):
@@ -163,6 +182,9 @@ class ScanPair:
     `sequence` names the recording (pairs of one sequence overlap in time: never split one between training and test), `name`
     the pair, `origin` where the data comes from. `initial_motion` (3,) is a guess of the background's `T_target_source`, from
     odometry or the motion before; None: there is none.
+
+    Raises:
+        TorchCRFScanError: a field of another type, or beyond these bounds.
     """
 
     source: Scan
@@ -175,8 +197,22 @@ class ScanPair:
     initial_motion: Floats | None = None
 
     def __post_init__(self) -> None:
-        if not SHORTEST <= self.dt <= LONGEST:
+        kinds = {"source": Scan, "target": Scan, "annotation": Annotation | None, "sequence": str, "name": str, "origin": str}
+        for name, kind in kinds.items():
+            if not isinstance(getattr(self, name), kind):
+                told = getattr(kind, "__name__", "Annotation or None")
+                raise TorchCRFScanError(f"{name}: expected {told}, got {type(getattr(self, name)).__name__}")
+        dt = number("dt", self.dt, "seconds")
+        if not SHORTEST <= dt <= LONGEST:
             raise TorchCRFScanError(f"dt: expected seconds between {SHORTEST:g} and {LONGEST:g}, got {self.dt}")
+        object.__setattr__(self, "dt", dt)
+        if self.initial_motion is not None:
+            guess = vector("initial_motion", self.initial_motion, 3)
+            if not (np.abs(guess) <= FARTHEST).all():
+                raise TorchCRFScanError(
+                    f"initial_motion: expected finite numbers (theta, tx, ty) within {FARTHEST:g}, got {guess.tolist()}"
+                )
+            object.__setattr__(self, "initial_motion", guess)
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,16 +44,19 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 def whole_path(path: Path) -> Iterator[Path]:
     """As `whole_file`, for libraries that write by name: the path of a file or folder of the same name, elsewhere.
 
+    A file takes the place of a file, a folder that of a folder; a folder is never lost to a file.
+
     Raises:
-        OSError: the block wrote nothing there, or it could not be moved.
+        OSError: the block wrote nothing there, or it could not be moved; the old content is kept.
     """
     beside = _beside(path)
     beside.mkdir()
+    written = beside / path.name
     try:
-        yield beside / path.name
-        if path.is_dir():
-            shutil.rmtree(path)
-        os.replace(beside / path.name, path)
+        yield written
+        if path.is_dir() and written.is_dir():  # only an empty folder can be replaced
+            os.replace(path, beside / f"{path.name}.old")
+        os.replace(written, path)
     finally:
         shutil.rmtree(beside)
     _sync(path.parent)
@@ -92,7 +95,7 @@ def write_whole(path: Path, content: bytes | str) -> None:
 
 
 def make_folder(option: str, folder: str | Path) -> Path:
-    """Creates a folder if necessary; raises ValueError, with the name of its option, for one that cannot be."""
+    """Creates a folder if necessary; raises TorchCRFScanError, with the name of its option, for one that cannot be."""
     if not str(folder):
         raise TorchCRFScanError(f"{option}: expected a folder, got an empty name")
     try:

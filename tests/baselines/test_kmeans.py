@@ -23,7 +23,10 @@ TURNED = np.array([0.2, 0.0, 0.0])
 def truly_matched(pair: ScanPair, motion: np.ndarray, moving: np.ndarray, shift: np.ndarray) -> tuple[ScanPair, PairPrediction]:
     """The pair whose target are the source's own points, moved, and the association i -> i."""
     ends = se2.apply(motion, pair.source.points + moving[:, None] * shift)
-    target = replace(pair.source, ranges=np.linalg.norm(ends, axis=1), bearings=np.arctan2(ends[:, 1], ends[:, 0]))
+    bearings = np.arctan2(ends[:, 1], ends[:, 0])
+    order = np.argsort(bearings)
+    ranges, beam = np.linalg.norm(ends, axis=1)[order], pair.source.beam[order]
+    target = replace(pair.source, ranges=ranges, bearings=bearings[order], beam=beam)
     identity = match_icp(ScanPair(pair.source, pair.source))
     return replace(pair, target=target), replace(identity, motions=motion[None])
 
@@ -52,7 +55,8 @@ def test_removing_the_motion_finds_the_box_where_turning_shatters_the_room() -> 
     found = cluster_displacements(pair, matched, clusters=2, remove_motion=True)
     assert (found.cluster == box).all()
     assert np.allclose(found.motions[0], TURNED)
-    assert np.allclose(se2.apply(found.motions[1], pair.source.points[box]), pair.target.points[box])
+    ends = pair.target.to_beams(pair.target.points, np.nan)
+    assert np.allclose(se2.apply(found.motions[1], pair.source.points[box]), ends[pair.source.beam[box]])
     shattered = cluster_displacements(pair, matched, clusters=2)
     assert np.mean(shattered.cluster[~box] == 0) < 0.9
 

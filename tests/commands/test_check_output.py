@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from command_line import fail, run
+from results import carmen_log
 
 from torchcrf_scan.commands.odometry import odometry
 from torchcrf_scan.commands.play import play
@@ -31,4 +32,14 @@ def test_run_does_not_replace_its_log(tmp_path: Path, capsys: pytest.CaptureFixt
     before = log.read_bytes()
     capsys.readouterr()
     assert "expected another file than the log" in fail(capsys, "run", log, "--output", tmp_path)
+    assert log.read_bytes() == before
+
+
+def test_nor_does_its_clean_log_or_the_file_for_the_viewer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = carmen_log(tmp_path / "clean.log")
+    before = log.read_bytes()
+    assert "expected another file than the log" in fail(capsys, "run", log, "--output", tmp_path, "--clean")
+    assert "--rerun: expected another file than the log" in fail(
+        capsys, "odometry", log, "--output", tmp_path / "poses.tum", "--rerun", log
+    )
     assert log.read_bytes() == before

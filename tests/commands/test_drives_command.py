@@ -14,13 +14,13 @@ pytest.importorskip("trackeval", reason="needs trackeval (extra tracking)")
 
 
 def test_a_short_drive_is_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = run("drives", "--worlds", "cars_240", "--scans", "12", "--count", "1", "--json", str(tmp_path / "rows.json"))
+    code = run("drives", "--worlds", "cars_240", "--scans", "12", "--count", "1", "--json", str(tmp_path / "new" / "rows.json"))
     assert code == 0
     header, line, row = capsys.readouterr().out.splitlines()
     assert header.startswith("| world | movers | found by pairs, % |")
     assert row.startswith("| cars_240 |")
     assert header.count("|") == line.count("|") == row.count("|")
-    values = json.loads((tmp_path / "rows.json").read_text())["cars_240"]
+    values = json.loads((tmp_path / "new" / "rows.json").read_text())["cars_240"]
     assert values["scans_per_second"] > 0
     assert 0 <= values["false_moving"] < 20
     assert 0 <= values["hota"] <= 100

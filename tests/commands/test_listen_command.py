@@ -64,6 +64,7 @@ def test_listen_keeps_up_with_a_recorded_robot(tmp_path: Path, capsys: pytest.Ca
 
 def test_wrong_options_are_named(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     assert "--waiting: expected at least 1 scan, got 0" in fail(capsys, "listen", "--waiting=0")
+    assert "--no_return: expected metres above 0, got -1.0" in fail(capsys, "listen", "--no_return=-1")
     assert "domain: expected a number from 0 to 232, got 1000" in fail(capsys, "listen", "--domain=1000")
     message = fail(capsys, "listen", "--topic=a b", "--loopback=true", f"--domain={DOMAIN + 101}")
     assert "topic: expected a name like /scan, got 'a b'" in message

@@ -9,7 +9,7 @@ import pytest
 from command_line import contents, fail, run
 
 from torchcrf_scan import JointScanCRF, PairPrediction, ScanPair
-from torchcrf_scan.commands import arguments
+from torchcrf_scan.commands import match as match_command
 from torchcrf_scan.commands.arguments import PairPlace
 from torchcrf_scan.commands.match import describe, mover_speeds
 from torchcrf_scan.data.carmen import CarmenLog
@@ -86,10 +86,10 @@ def test_a_malformed_line_of_a_log_is_left_out(
     assert run("match", log, "--output", tmp_path / "out", "--model", model_dir) == 0
     out, err = capsys.readouterr()
     assert "4 of 4 pairs matched" in out
-    assert f"; 1 scans or messages left out, the first because of {log}, line 3 (byte " in out
+    assert f"; 1 scan or message left out, because of {log}, line 3 (byte " in out
     assert err == ""
     assert run("plot", log, "--number=3", "--output", tmp_path / "a.png") == 0
-    assert "; 1 scans or messages left out, " in capsys.readouterr().out
+    assert "; 1 scan or message left out, " in capsys.readouterr().out
 
 
 def test_a_pair_that_the_model_cannot_take_does_not_lose_the_others(
@@ -144,7 +144,7 @@ def test_match_makes_the_pairs_of_a_log_when_their_turn_comes(
         sizes.append(len(made))
         raise ValueError("not today")
 
-    monkeypatch.setattr(arguments, "BATCH", 2)
+    monkeypatch.setattr(match_command, "BATCH", 2)
     monkeypatch.setattr(PairPlace, "read", make)
     monkeypatch.setattr(JointScanCRF, "match_pairs", match_none)
     assert run("match", log_file, "--output", tmp_path, "--model", model_dir) == 1
@@ -181,7 +181,7 @@ def test_a_broken_log_does_not_lose_the_others(
     assert run("match", broken, short, log_file, "--every=2", "--output", tmp_path / "out", "--model", model_dir) == 1
     out, err = capsys.readouterr()
     assert "2 of 2 pairs matched" in out
-    assert f"; 1 scans or messages left out, the first because of {broken}, line 2 (byte {len(lines[0]) + 1}): expected" in out
+    assert f"; 1 scan or message left out, because of {broken}, line 2 (byte {len(lines[0]) + 1}): expected" in out
     for path, line in zip((broken, short), err.splitlines(), strict=True):
         assert f"{path}: expected at least two" in line
     assert len(list((tmp_path / "out").iterdir())) == 2

@@ -42,6 +42,7 @@ def test_plot_asks_for_the_number_of_a_logs_pair(
     for options, got in (([], "None"), (["--number=4"], "4"), (["--number=-1"], "-1")):
         assert f"--number: expected which pair of {log_file}, 0 to 3, got {got}" in message(log_file, *options)
     assert "--number: expected none but with a log" in message(pairs_dir / "sim_s0_000.npz", "--number=0")
+    assert "topic: expected none, as this is a pair file, got /scan" in message(pairs_dir / "sim_s0_000.npz", "--topic=/scan")
     assert "nowhere.log" in message(tmp_path / "nowhere.log", "--number=0")
 
 

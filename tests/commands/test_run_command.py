@@ -121,7 +121,7 @@ def test_a_malformed_line_is_left_out_and_counted(
     assert run("run", log, "--output", tmp_path / "out", "--clean") == 0
     out, err = capsys.readouterr()
     assert "30 scans, " in out
-    assert f"1 scans or messages left out, the first because of {log}, line {len(lines) - 4} (byte " in out
+    assert f"1 scan or message left out, because of {log}, line {len(lines) - 4} (byte " in out
     assert err == ""
     assert (tmp_path / "out" / "clean.log").read_text().count("FLASER") == 30
 
@@ -187,20 +187,21 @@ def test_a_failing_output_is_closed_once() -> None:
 
 
 @pytest.mark.usefixtures("fast_start")
-def test_ctrl_c_leaves_what_was_written_valid(
-    stream: FakeStream, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_ctrl_c_and_termination_leave_what_was_written_valid(
+    number: signal.Signals, code: int, stream: FakeStream, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     feed = FakeStream.feed
 
     def interrupting(self: FakeStream, *arguments: Any) -> Any:
         if self.fed == 8:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         return feed(self, *arguments)
 
     monkeypatch.setattr(FakeStream, "feed", interrupting)
-    before = signal.getsignal(signal.SIGINT)
-    assert run("run", log, "--output", tmp_path / "out", "--clean") == 130
-    assert signal.getsignal(signal.SIGINT) is before
+    before = signal.getsignal(number)
+    assert run("run", log, "--output", tmp_path / "out", "--clean") == code
+    assert signal.getsignal(number) is before
     assert names(tmp_path / "out") == ALL | {"clean.log"}
     assert len(read_trajectory(tmp_path / "out" / "poses.tum")) == 9
     assert (tmp_path / "out" / "clean.log").read_text().count("FLASER") == 9

@@ -70,3 +70,4 @@ def test_motions_between_poses() -> None:
     assert rest == [None, None]
     assert motions_between([np.ones(3)] * 3) == [None, None]
     assert motions_between([None] * 3) == [None, None]
+    assert motions_between([np.zeros(3), np.array([0.0, 1e9, 0.0])]) == [None]

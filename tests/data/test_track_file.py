@@ -77,6 +77,7 @@ def test_other_orders_and_further_columns(tmp_path: Path) -> None:
         (",".join(COLUMNS) + "\n1,2\n", "line 2: expected at least 10 fields, got 2"),
         (",".join(COLUMNS) + "\n1,2,3,4,5,6,7,8,nan,10\n", "line 2: width: expected a finite number, got 'nan'"),
         (",".join(COLUMNS) + "\n1,2.5,3,4,5,6,7,8,9,10\n", "line 2: id: expected a whole number, got '2.5'"),
+        (",".join(COLUMNS) + "\n1,99999999999999999999,3,4,5,6,7,8,9,10\n", "line 2: id: expected a whole number, got '9{20}'"),
     ],
 )
 def test_a_wrong_file_is_named(text: str, message: str, tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ def test_equal_steps_are_equal_at_any_time(step: float) -> None:
         clock.advance(k * step)
         times.append(clock.now)
     assert len({later - earlier for earlier, later in pairwise(times[::5])}) == 1
+    assert clock.elapsed == pytest.approx(999 * step, abs=1e-9)  # rounded steps would sum up to 0.4 ms
 
 
 def test_told_once(caplog: pytest.LogCaptureFixture) -> None:

@@ -22,7 +22,7 @@ def test_odometry_that_jumps_is_not_believed(model: JointScanCRF, jump: float) -
 
 
 def test_odometry_of_another_shape_is_an_error(model: JointScanCRF) -> None:
-    with pytest.raises(ValueError, match=r"odometry: expected three numbers.*\(4,\)"):
+    with pytest.raises(ValueError, match=r"odometry: expected shape \(3,\), got \(4,\)"):
         ScanStream(model).feed(scan_at(np.zeros(3)), 0.0, np.zeros(4))
 
 

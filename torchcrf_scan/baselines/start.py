@@ -6,13 +6,13 @@ uses the identity. The labels carry no belief: the confidences of valid beams ar
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchcrf_scan.batch import ScanPairBatch
+from torchcrf_scan.batch import ScanPairBatch, batches
 from torchcrf_scan.features.shape import gather_points
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.inference.start import Start, nearest_association
@@ -26,7 +26,7 @@ def match_start(model: JointScanCRF, pairs: Sequence[ScanPair], batch_size: int 
     """Predictions from `model.initialise` alone: no chains, no iterations. On the model's device and in its dtype."""
     reference = next(model.parameters())
     found = []
-    for part in _parts(pairs, batch_size):
+    for part in batches(pairs, batch_size):
         batch = ScanPairBatch.collate(part, reference.dtype).without_truth().to(reference.device)
         prediction = label_nearest(batch, model.initialise(batch))
         found += [prediction.pair(b, pair) for b, pair in enumerate(part)]
@@ -37,7 +37,7 @@ def match_start(model: JointScanCRF, pairs: Sequence[ScanPair], batch_size: int 
 def match_static(pairs: Sequence[ScanPair], batch_size: int = 16) -> list[PairPrediction]:
     """Predictions of a static world and sensor: background everywhere, nearest points inside the gate."""
     found = []
-    for part in _parts(pairs, batch_size):
+    for part in batches(pairs, batch_size):
         batch = ScanPairBatch.collate(part).without_truth()
         motions = batch.initial_motion.new_zeros(len(batch), 1, 3)
         active = torch.ones(len(batch), 1, dtype=torch.bool)
@@ -77,8 +77,3 @@ def nearest_motion(batch: ScanPairBatch, start: Start) -> Tensor:
     moved = se2.apply(start.motions, batch.source[:, None])  # (B, C, N, 2)
     residual = torch.linalg.vector_norm(moved - partner[:, None], dim=-1)  # (B, C, N)
     return residual.masked_fill(~start.active[..., None], torch.inf).argmin(1)
-
-
-def _parts(pairs: Sequence[ScanPair], size: int) -> Iterator[Sequence[ScanPair]]:
-    for begin in range(0, len(pairs), size):
-        yield pairs[begin : begin + size]

@@ -63,7 +63,8 @@ def annotate(
         from torchcrf_scan.annotate.server import ADDRESS, make_server, serve
     except ImportError as error:
         raise TorchCRFScanError(f"annotate: expected bokeh (pip install torchcrf-scan[annotate]), got {error}") from error
-    failures, left_out = list[str](), LeftOut()
+    failures: list[str] = []
+    left_out = LeftOut()
     places = find_pairs(files, every, failures, ReadOptions(topic, odometry, no_return, left_out.add))
     store = Store(make_folder("--output", output))
     _check(port, outlier_distance, places, store)
@@ -84,7 +85,7 @@ def annotate(
 
 
 def _check(port: int, outlier_distance: float | None, places: list[PairPlace], store: Store) -> None:
-    """Raises TorchCRFScanError for a port or distance that cannot be, or if an annotation would replace the file of its pair."""
+    """Raises TorchCRFScanError for an impossible port or distance, or if an annotation would replace a file that it is made of."""
     if not 0 <= port < 1 << 16:
         raise TorchCRFScanError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
     if outlier_distance is not None and not 0 < outlier_distance < float("inf"):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
@@ -20,8 +20,6 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.safe_names import one_line
 from torchcrf_scan.scan import ScanPair
 
-Item = TypeVar("Item")
-
 BATCH = 16  # pairs matched at once
 
 
@@ -32,7 +30,7 @@ def load_model(
     threads: int | None = None,
     outlier_distance: float | None = None,
 ) -> JointScanCRF:
-    """A saved model on a device; raises ValueError for a damaged one, a missing device or an invalid number of threads.
+    """A saved model on a device; raises TorchCRFScanError for a damaged one, a missing device or an invalid number of threads.
 
     candidates, outlier_distance: of `InferenceConfig`; None: as saved.
     """
@@ -77,12 +75,26 @@ class PairPlace:
 
 
 def find_files(patterns: Sequence[str]) -> list[Path]:
-    """The matching files, each once; raises ValueError for two of the same name, as predictions are named like their pairs."""
+    """The matching files, each once; raises TorchCRFScanError for two of one name, as predictions are named like their pairs."""
     return [place.path for place in _each_once(PairPlace(path) for path in PairFiles(*patterns).paths)]
 
 
+def annotated_pairs(patterns: Sequence[str]) -> dict[Path, ScanPair]:
+    """The pairs of the matching pair files; raises TorchCRFScanError for a log, or a pair without annotation."""
+    files = find_files(patterns)
+    for path in files:
+        form = find_format(path)
+        if form is not None and form is not PAIR:
+            raise TorchCRFScanError(f"{path}: expected an annotated pair file (.npz), got a {form.name}, which has no annotation")
+    pairs = {path: read_pair(path) for path in files}
+    for path, pair in pairs.items():
+        if pair.annotation is None:
+            raise TorchCRFScanError(f"{path}: expected an annotated pair (keys association and cluster), got one without")
+    return pairs
+
+
 def find_pairs(patterns: Sequence[str], every: int, failures: list[str], options: ReadOptions = AS_RECORDED) -> list[PairPlace]:
-    """The pairs of the matching files, each once, of logs every N-th; raises ValueError for two of the same name.
+    """The pairs of the matching files, each once, of logs every N-th; raises TorchCRFScanError for two of the same name.
 
     A log that cannot be read contributes none, one that is damaged those before the fault; the reason is added to `failures`.
     """
@@ -109,6 +121,7 @@ def read_one(file: str, number: int | None, options: ReadOptions = AS_RECORDED) 
     if find_format(file) is PAIR:
         if number is not None:
             raise TorchCRFScanError(f"--number: expected none but with a log, got {number} with {file}")
+        PAIR.check(file, options)
         return read_pair(file)
     log = read_recording(file, options)
     if number is None or not 0 <= number < len(log):
@@ -131,23 +144,17 @@ def listed(values: tuple[str, ...] | str) -> tuple[str, ...]:
 
 
 def check_output(output: str, log: str) -> None:
-    """Raises ValueError for an output that is a folder, or would replace the log that it is made of."""
+    """Raises TorchCRFScanError for an output that is a folder, or would replace the log that it is made of."""
     path = Path(output)
     if path.exists() and not path.is_file():
         raise TorchCRFScanError(
             f"--output: expected a file to write, got {output!r}, {'a folder' if path.is_dir() else 'a device or pipe'}"
         )
-    check_other(output, log)
+    check_other("--output", output, log)
 
 
-def check_other(output: str, log: str) -> None:
-    """Raises ValueError for an output that would replace the log that it is made of."""
+def check_other(option: str, output: str | Path, log: str | Path) -> None:
+    """Raises TorchCRFScanError for an output, as an option tells it, that would replace the log that it is made of."""
     path = Path(output)
     if path.exists() and Path(log).exists() and path.samefile(log):
-        raise TorchCRFScanError(f"--output: expected another file than the log, got {output}")
-
-
-def batches(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
-    """The items in their order, `BATCH` at a time."""
-    for begin in range(0, len(items), BATCH):
-        yield items[begin : begin + BATCH]
+        raise TorchCRFScanError(f"{option}: expected another file than the log, got {output}")

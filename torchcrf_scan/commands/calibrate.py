@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchcrf_scan.commands.arguments import find_files, load_model
-from torchcrf_scan.data.pair_file import read_pair
+from torchcrf_scan.commands.arguments import annotated_pairs, load_model
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED, WEIGHTS
 from torchcrf_scan.whole_file import make_folder
@@ -27,10 +26,7 @@ def calibrate(pair_files: list[str], output: str, *, model: str = PRETRAINED, th
     from torchcrf_scan.learning.leaks import TrainedOn
     from torchcrf_scan.learning.own_laser import calibrate_on
 
-    pairs = {path: read_pair(path) for path in find_files(pair_files)}
-    for path, pair in pairs.items():
-        if pair.annotation is None:
-            raise TorchCRFScanError(f"{path}: expected an annotated pair (keys association and cluster), got one without")
+    pairs = annotated_pairs(pair_files)
     network = load_model(model, threads=threads)
     folder = make_folder("--output", output)
     if any(folder.iterdir()) and not (folder / WEIGHTS).is_file():

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchcrf_scan.commands.arguments import batches
+from torchcrf_scan.batch import batches
+from torchcrf_scan.commands.arguments import BATCH
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.evaluation.causes.trace import SearchTrace
 from torchcrf_scan.model import JointScanCRF
@@ -34,7 +35,7 @@ class Traced:
 
 
 def check(output: str | None, worst: int, causes: bool) -> None:
-    """Raises ValueError for options that need `--causes`."""
+    """Raises TorchCRFScanError for options that need `--causes`."""
     if not causes and output is not None:
         raise TorchCRFScanError(f"--output: expected none without --causes, got {output}")
     if worst < 0:
@@ -42,10 +43,10 @@ def check(output: str | None, worst: int, causes: bool) -> None:
 
 
 def trace(model: JointScanCRF, pairs: Sequence[ScanPair]) -> Traced:
-    """The answers of a model with the traces of its search; raises ValueError for a model that cannot be traced."""
+    """The answers of a model with the traces of its search; raises TorchCRFScanError for a model that cannot be traced."""
     from torchcrf_scan.evaluation.metrics import score_pairs
 
-    found = [both for part in batches(pairs) for both in model.trace_pairs(part)]
+    found = [both for part in batches(pairs, BATCH) for both in model.trace_pairs(part)]
     answers, traces = [answer for answer, _ in found], [of for _, of in found]
     return Traced(model, pairs, answers, traces, score_pairs(pairs, answers))
 

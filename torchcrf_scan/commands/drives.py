@@ -9,7 +9,7 @@ from pathlib import Path
 from torchcrf_scan.commands.arguments import listed, load_model
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED
-from torchcrf_scan.whole_file import write_whole
+from torchcrf_scan.whole_file import make_folder, write_whole
 
 HEADER = {
     "movers": "movers",
@@ -63,6 +63,8 @@ def drives(
         import trackeval  # noqa: F401
     except ImportError as error:
         raise TorchCRFScanError(f"expected the library trackeval, which scores tracks (extra `tracking`), got {error}") from error
+    if json:
+        make_folder("--json", Path(json).parent)
     loaded = load_model(model)
     print("| world | " + " | ".join(HEADER.values()) + " |\n|" + "---|" * (len(HEADER) + 1))
     rows = {}

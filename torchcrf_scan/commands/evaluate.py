@@ -13,15 +13,15 @@ from tqdm import tqdm
 
 from torchcrf_scan.baselines.register import by_command
 from torchcrf_scan.baselines.start import match_start, match_static
+from torchcrf_scan.batch import batches
 from torchcrf_scan.commands import frames
-from torchcrf_scan.commands.arguments import batches, find_files, load_model
+from torchcrf_scan.commands.arguments import BATCH, annotated_pairs, load_model
 from torchcrf_scan.commands.causes import check as check_causes
 from torchcrf_scan.commands.causes import explain
 from torchcrf_scan.commands.frames import FrameOffset, Turn, match_displaced
 from torchcrf_scan.commands.rounds import tell_rounds
 from torchcrf_scan.commands.sequences import by_sequence, figures_of, rows_of, without_nan
-from torchcrf_scan.data.formats import PAIR, find_format
-from torchcrf_scan.data.pair_file import read_pair, read_prediction
+from torchcrf_scan.data.pair_file import read_prediction
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.pretrained import PRETRAINED
@@ -102,7 +102,7 @@ def evaluate(
     _check_joint({"--causes": causes, "--rounds": rounds}, method, (predictions, displacement))
     if json is not None:
         make_folder("--json", Path(json).parent)
-    pairs = _annotated_pairs(pair_files)
+    pairs = annotated_pairs(pair_files)
     load = partial(load_model, PRETRAINED if model is None else model, candidates, device, threads, outlier_distance)
     name = "joint" if method is None else method
     if predictions is not None:
@@ -176,19 +176,6 @@ def _displacement(metres: float | None, turn: Turn | None, predictions: str | No
     return FrameOffset(metres or 0.0, turn or 0.0)
 
 
-def _annotated_pairs(patterns: Sequence[str]) -> dict[Path, ScanPair]:
-    files = find_files(patterns)
-    for path in files:
-        form = find_format(path)
-        if form is not None and form is not PAIR:
-            raise TorchCRFScanError(f"{path}: expected an annotated pair file (.npz), got a {form.name}, which has no annotation")
-    pairs = {path: read_pair(path) for path in files}
-    for path, pair in pairs.items():
-        if pair.annotation is None:
-            raise TorchCRFScanError(f"{path}: expected an annotated pair (keys association and cluster), got one without")
-    return pairs
-
-
 def _read_predictions(paths: Sequence[Path], folder: Path) -> list[PairPrediction]:
     files = [folder / f"{path.stem}.npz" for path in paths]
     missing = [file for file in files if not file.is_file()]
@@ -214,7 +201,7 @@ def _run(name: str, load: Loader, pairs: Sequence[ScanPair], displacement: Frame
 def _in_batches(method: Callable[[Sequence[Item]], list[PairPrediction]], items: Sequence[Item]) -> list[PairPrediction]:
     found: list[PairPrediction] = []
     with tqdm(total=len(items), unit="pair", disable=None) as bar:
-        for part in batches(items):
+        for part in batches(items, BATCH):
             found += method(part)
             bar.update(len(part))
     return found

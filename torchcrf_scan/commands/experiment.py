@@ -56,7 +56,7 @@ def read_variants(folder: Path, config: RunConfig) -> dict[str, RunConfig]:
     """The variants of `config` in a folder: one per YAML file, or with `experiment.leave_out` one for each feature named there.
 
     Raises:
-        ValueError: no YAML file, or one with unknown settings.
+        TorchCRFScanError: no YAML file, or one with unknown settings.
     """
     files = sorted(folder.glob("*.yaml"))
     if not files:

@@ -34,4 +34,6 @@ class LeftOut:
 
     def __str__(self) -> str:
         """The end of a line."""
-        return f"; {self.count} scans or messages left out, the first because of {self.first}" if self.count else ""
+        if self.count < 2:
+            return f"; 1 scan or message left out, because of {self.first}" if self.count else ""
+        return f"; {self.count} scans or messages left out, the first because of {self.first}"

@@ -69,6 +69,8 @@ def listen(
     """
     if waiting < 1:
         raise TorchCRFScanError(f"--waiting: expected at least 1 scan, got {waiting}")
+    if not no_return > 0:
+        raise TorchCRFScanError(f"--no_return: expected metres above 0, got {no_return}")
     network = Network(domain, (LOOPBACK,), LOOPBACK) if loopback else Network(domain, listed(peers), interface)
     answering = ScanStream(load_model(model, None, device, threads), stream)
     names = {"topic": topic, "prefix": prefix, "world": world}

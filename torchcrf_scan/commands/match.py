@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from torchcrf_scan.commands.arguments import batches, find_pairs, load_model
+from torchcrf_scan.batch import batches
+from torchcrf_scan.commands.arguments import BATCH, find_pairs, load_model
 from torchcrf_scan.commands.failures import LeftOut, attempt
 from torchcrf_scan.data.options import ReadOptions
 from torchcrf_scan.data.pair_file import read_prediction, write_prediction
@@ -66,7 +67,7 @@ def match(
     make_folder("--output", output)
     moving: list[tuple[int, int]] = []
     with tqdm(total=len(places), unit="pair", disable=None) as bar:
-        for part in batches(places):
+        for part in batches(places, BATCH):
             pairs = {str(place): pair for place in part if (pair := attempt(failures, place.read)) is not None}
             for where, prediction in _match_batch(network, pairs, failures).items():
                 pair = pairs[where]

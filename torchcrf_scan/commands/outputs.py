@@ -90,7 +90,7 @@ def movie_file(path: Path, seconds: float, speed: float, is_in_world: bool) -> I
 
 
 def check_speed(speed: float) -> None:
-    """Raises ValueError for a speed that a movie cannot have."""
+    """Raises TorchCRFScanError for a speed that a movie cannot have."""
     if not 0 < speed < float("inf"):
         raise TorchCRFScanError(f"--speed: expected more than 0 times the recording's own, got {speed}")
 
@@ -108,7 +108,7 @@ def summary_picture(path: Path, name: str) -> Iterator[Add]:
 
 
 def viewers(visualize: bool, rerun: str | None) -> dict[str, Output]:
-    """The viewer's window and file, as far as they are asked for; raises ValueError where it is not installed."""
+    """The viewer's window and file, as far as they are asked for; raises TorchCRFScanError where it is not installed."""
     from torchcrf_scan.viz.viewer import check_viewer, showing, writing_rerun
 
     found: dict[str, Output] = {}

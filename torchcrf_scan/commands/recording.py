@@ -8,24 +8,22 @@ from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
 from time import perf_counter
-from typing import Protocol
 
 import numpy as np
 from tqdm import tqdm
 
-from torchcrf_scan.commands.arguments import load_model
+from torchcrf_scan.commands.arguments import check_other, load_model
 from torchcrf_scan.commands.failures import LeftOut
 from torchcrf_scan.commands.outputs import Add, Output, Outputs, viewers
-from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
+from torchcrf_scan.commands.stopping import Stopping
 from torchcrf_scan.data.formats import read_scans
 from torchcrf_scan.data.options import AUTO, ReadOptions
 from torchcrf_scan.data.reading import Reading
 from torchcrf_scan.data.recording import log_name
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.pretrained import PRETRAINED
-from torchcrf_scan.result import ScanResult
+from torchcrf_scan.result import Stream
 from torchcrf_scan.safe_names import one_line
-from torchcrf_scan.scan import Floats, Scan
 from torchcrf_scan.stream.clock import Clock
 from torchcrf_scan.stream.stream import ScanStream
 from torchcrf_scan.viz.history import Tally
@@ -35,13 +33,6 @@ MakeOutputs = Callable[[float], Mapping[str, Output]]  # of the seconds between 
 LOOK_AHEAD = 21  # readings from whose stamps the time between scans is found
 ROUNDING = 1e-6  # seconds; stamps have no more digits
 SECONDS = (0.005, 5.0)  # between scans, plausible ones
-
-
-class Stream(Protocol):
-    """What makes results of scans."""
-
-    def feed(self, scan: Scan, stamp: float, odometry: Floats | None = None) -> ScanResult:
-        """What is known after one more scan."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +89,7 @@ class Options:
         return self.use_odometry or self.odometry is not None
 
     def make_stream(self) -> Callable[[], Stream]:
-        """A maker of streams that share one model; raises ValueError for a model or device that is not there."""
+        """A maker of streams that share one model; raises TorchCRFScanError for a model or device that is not there."""
         model = load_model(self.model, None, self.device, self.threads, self.outlier_distance)
         return lambda: ScanStream(model)
 
@@ -112,14 +103,13 @@ class Report:
 
     Attributes:
         tally: counts of its results. left_out: scans and messages that are none.
-        failures: what went wrong, one line each. rate: scans a second, until all is written. is_interrupted: Ctrl-C ended it.
+        failures: what went wrong, one line each. rate: scans a second, until all is written.
     """
 
     tally: Tally = field(default_factory=Tally)
     left_out: LeftOut = field(default_factory=LeftOut)
     failures: list[str] = field(default_factory=list)
     rate: float = 0.0
-    is_interrupted: bool = False
 
     def describe(self) -> str:
         """One line."""
@@ -134,7 +124,7 @@ def chosen(readings: Iterable[Reading], options: Options) -> Iterator[Reading]:
     clock, count = Clock(warns=False), 0  # the stream warns
     for reading in readings:
         clock.advance(reading.stamp)
-        since = clock.now
+        since = clock.elapsed
         if options.end is not None and since > options.end + ROUNDING:
             return
         if since >= options.start - ROUNDING:
@@ -166,7 +156,7 @@ def process(
         position: line of the progress bar.
 
     Raises:
-        ValueError: a recording without a scan; then there are no outputs.
+        TorchCRFScanError: a recording without a scan; then there are no outputs.
     """
     report, told = Report(), options.reading
     topic, odometry, no_return = told.topic, told.odometry, told.no_return
@@ -187,7 +177,6 @@ def process(
             _feed(stream, reading, options, add, report)
             bar.update()
             if stopping.is_asked:
-                report.is_interrupted = True
                 break
     report.rate = report.tally.scans / (perf_counter() - begin)
     return report
@@ -214,6 +203,8 @@ def typical_seconds(readings: list[Reading]) -> float:
 def process_one(command: str, log: str, options: Options, outputs: MakeOutputs, made: str) -> int:
     """Processes one recording for a command, says what was made, and returns the command's exit code."""
     viewers(options.visualize, options.rerun)  # an error now, not after the first scans
+    if options.rerun is not None:
+        check_other("--rerun", options.rerun, log)
     make_stream = options.make_stream()
 
     def all_outputs(seconds: float) -> Mapping[str, Output]:
@@ -224,4 +215,4 @@ def process_one(command: str, log: str, options: Options, outputs: MakeOutputs, 
     print(f"{log}: {report.describe()}; {made}")
     for failure in report.failures:
         print(f"torchcrf-scan {command}: error: {failure}", file=sys.stderr)
-    return INTERRUPTED if report.is_interrupted else 1 if report.failures else 0
+    return stopping.code or (1 if report.failures else 0)

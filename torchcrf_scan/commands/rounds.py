@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def tell_rounds(model: JointScanCRF, pairs: Sequence[ScanPair]) -> tuple[list[Table], dict[str, Any]]:
-    """Tables and entries of `--json`; raises ValueError as `check` does."""
+    """Tables and entries of `--json`; raises TorchCRFScanError as `check` does."""
     from torchcrf_scan.evaluation.convergence import convergence_figures, convergence_tables
 
     check(model)
@@ -40,7 +40,7 @@ def tell_rounds(model: JointScanCRF, pairs: Sequence[ScanPair]) -> tuple[list[Ta
 
 
 def check(model: JointScanCRF) -> None:
-    """Raises ValueError for a model without rounds, or whose rounds do not decode two chains in turns."""
+    """Raises TorchCRFScanError for a model without rounds, or whose rounds do not decode two chains in turns."""
     config = model.config
     in_turns = not COUPLINGS[config.coupling].chain and SCHEDULES[config.inference.schedule].takes_couplings
     if not (config.has_association and config.has_clusters and in_turns and config.inference.iterations > 0):

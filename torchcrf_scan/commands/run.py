@@ -11,12 +11,13 @@ from typing import Literal
 from torchcrf_scan.commands.apart import Apart
 from torchcrf_scan.commands.arguments import check_other
 from torchcrf_scan.commands.outputs import Output, check_speed, movie_file, poses_file, summary_picture, tracks_file, viewers
-from torchcrf_scan.commands.recording import DEFAULTS, MakeOutputs, Options, Stream, process
-from torchcrf_scan.commands.stopping import INTERRUPTED, Stopping
+from torchcrf_scan.commands.recording import DEFAULTS, MakeOutputs, Options, process
+from torchcrf_scan.commands.stopping import Stopping
 from torchcrf_scan.data.clean_log import clean_name, writing_clean
 from torchcrf_scan.data.recording import log_name
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.learning.ranks import join
+from torchcrf_scan.result import Stream
 from torchcrf_scan.safe_names import one_line
 from torchcrf_scan.whole_file import make_folder
 
@@ -62,11 +63,11 @@ def run(
         is_first = ranks.is_first
     for failure in everyone if is_first else []:
         print(f"torchcrf-scan run: error: {failure}", file=sys.stderr)
-    return INTERRUPTED if stopping.is_asked else 1 if everyone else 0
+    return stopping.code or (1 if everyone else 0)
 
 
 def _folders(logs: Sequence[str], output: Path) -> dict[str, Path]:
-    """The folder of every log; raises ValueError for two logs of the same name."""
+    """The folder of every log; raises TorchCRFScanError for two logs of the same name."""
     if len(logs) == 1:
         return {logs[0]: output}
     folders = {log: output / log_name(Path(log)) for log in logs}
@@ -82,10 +83,11 @@ def _outputs(
     from torchcrf_scan.viz.movie import can_write_mp4
 
     make_folder("--output", folder)
-    for name in ("poses.tum", "tracks.csv", "summary.png", "movie.mp4", "movie.gif"):
-        check_other(str(folder / name), str(log))
+    names = ("poses.tum", "tracks.csv", "summary.png", "movie.mp4", "movie.gif")
+    for name in (*names, clean_name(log)) if clean else names:
+        check_other("--output", folder / name, log)
     if options.rerun is not None:
-        check_other(options.rerun, str(log))
+        check_other("--rerun", options.rerun, log)
     movie = folder / ("movie.mp4" if can_write_mp4() else "movie.gif")
     outputs: dict[str, Output] = {
         "poses.tum": poses_file(folder / "poses.tum"),

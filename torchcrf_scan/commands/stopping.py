@@ -8,18 +8,25 @@ from types import FrameType, TracebackType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-INTERRUPTED = 130  # exit code, as shells have it
 
 
 class Stopping:
     """While it is entered, signals set `is_asked` instead of ending the program; the loop looks at it after every step.
 
     Further signals change nothing, as `torchrun` and a terminal both send them to all processes.
+
+    Attributes:
+        code: exit code as shells have it, 130 after Ctrl-C and 143 after termination; 0: go on.
     """
 
     def __init__(self) -> None:
-        self.is_asked = False
+        self.code = 0
         self._before: dict[int, Any] = {}
+
+    @property
+    def is_asked(self) -> bool:
+        """Whether the loop is to end."""
+        return self.code != 0
 
     def __enter__(self) -> Stopping:
         if threading.current_thread() is threading.main_thread():
@@ -31,4 +38,4 @@ class Stopping:
             signal.signal(number, handler)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
-        self.is_asked = True
+        self.code = self.code or 128 + number

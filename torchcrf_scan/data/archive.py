@@ -22,7 +22,8 @@ def read_arrays(path: Path, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
     """The arrays of those keys that an archive holds.
 
     Raises:
-        ValueError: another format, a damaged or cut archive, one beyond `MOST_ARCHIVE`, an array of objects or beyond `MOST_ARRAY`.
+        TorchCRFScanError: another format, a damaged or cut archive, one beyond `MOST_ARCHIVE`, an array of objects or beyond
+            `MOST_ARRAY`.
         OSError: the file cannot be opened.
     """
     with open(path, "rb") as file:

@@ -7,7 +7,7 @@ import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol
 
 from torchcrf_scan.data.limits import MOST_CHUNK
 from torchcrf_scan.errors import TorchCRFScanError
@@ -57,11 +57,21 @@ class Bag(Protocol):
         """The topics, in the order in which they were found."""
 
     def messages(self, names: Collection[str]) -> Iterator[Message]:
-        """The messages of some topics as recorded; raises ValueError, with its offset, at a fault, after all before it."""
+        """The messages of some topics as recorded; raises TorchCRFScanError, with its offset, at a fault, after all before it."""
+
+
+def read_exactly(file: BinaryIO, size: int) -> bytes:
+    """The next `size` bytes; raises EOFError if there are fewer, TorchCRFScanError for more than `MOST_CHUNK`."""
+    if size > MOST_CHUNK:
+        raise TorchCRFScanError(f"expected at most {MOST_CHUNK} bytes, got {size}")
+    data = file.read(size)
+    if len(data) != size:
+        raise EOFError(f"{len(data)} of {size} bytes")
+    return data
 
 
 def unpack(data: bytes, compression: str, size: int) -> bytes:
-    """Unpacks a chunk of a stated size; raises ValueError if it is beyond the limit, or not of that size."""
+    """Unpacks a chunk of a stated size; raises TorchCRFScanError if it is beyond the limit, or not of that size."""
     if size > MOST_CHUNK:
         raise TorchCRFScanError(f"expected chunks of at most {MOST_CHUNK} bytes, got one of {size}")
     if compression in ("", "none"):
@@ -76,7 +86,7 @@ def unpack(data: bytes, compression: str, size: int) -> bytes:
 
 
 def unpack_message(data: bytes) -> bytes:
-    """Unpacks a message packed by zstd; raises ValueError if it is damaged, or beyond the limit."""
+    """Unpacks a message packed by zstd; raises TorchCRFScanError if it is damaged, or beyond the limit."""
     decompressor = _zstd()
     unpacked = _decompress(decompressor, data, MOST_CHUNK)
     if not decompressor.eof:

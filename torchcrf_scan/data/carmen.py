@@ -26,8 +26,8 @@ def read_carmen(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iterato
     found in the log (`no_return`). Odometry is that of the sensor; for RAWLASER lines, of the ODOM line before them.
 
     Raises:
-        ValueError: no scans; or, after every scan before it, a malformed line (unless `on_bad` takes it) or damaged file, with
-            line and byte.
+        TorchCRFScanError: no scans; or, after every scan before it, a malformed line (unless `on_bad` takes it) or damaged file,
+            with line and byte.
         OSError: the file cannot be opened.
     """
     path = Path(path)
@@ -82,7 +82,7 @@ class CarmenLog(Recording):
         topic: kind of lines to read; None: those of the front laser.
 
     Raises:
-        ValueError: fewer than two scans, or a file that cannot be read.
+        TorchCRFScanError: fewer than two scans, or a file that cannot be read.
     """
 
     def __init__(self, path: str | Path, *, no_return: float | None = None, topic: str | None = None) -> None:

@@ -53,7 +53,7 @@ def kind_of(text: str) -> str | None:
 
 
 def read_laser_line(line: Line, kind: str) -> LaserLine:
-    """The scan of a line; raises ValueError, with its place, if it is cut or malformed."""
+    """The scan of a line; raises TorchCRFScanError, with its place, if it is cut or malformed."""
     fields = line.text.split()
     try:
         return _read_fields(fields, kind.rstrip("0123456789").removesuffix("LASER"), line)

@@ -63,7 +63,7 @@ def survey(path: Path, options: ReadOptions) -> Survey:
     """Looks at the beginning of a log.
 
     Raises:
-        ValueError: no scans of the kind that is asked for, or of any; the message names those that there are.
+        TorchCRFScanError: no scans of the kind that is asked for, or of any; the message names those that there are.
     """
     seen = _Seen()
     for line in _first_lines(path, seen, options.topic):

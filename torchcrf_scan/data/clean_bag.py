@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from torchcrf_scan.data.ros_messages import CLOUD, LASER, ODOMETRY, TYPES, stamp_of
+from torchcrf_scan.data.ros_messages import CLOUD, LASER, ODOMETRY, point_layout, stamp_of
 from torchcrf_scan.data.spatial_covariance import spatial_covariance
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.result import ScanResult
@@ -24,7 +24,7 @@ FOUND = "/torchcrf_scan/odometry"  # topic of the odometry that was found
 FRAME = "odom"  # its frame
 VERSION: Literal[8] = 8  # of the metadata of a ROS 2 bag, which all distributions in use read
 STAMP_ERROR = 1e-6  # seconds
-XYZ = ("x", "y", "z")
+XYZ = {"x", "y", "z"}
 
 Write = Callable[[ScanResult], None]
 
@@ -41,7 +41,7 @@ def writing_clean_bag(source: Path, target: Path, topic: str | None = None) -> I
         topic: of the scans; None: the only one.
 
     Raises:
-        ValueError: a bag that rosbags cannot read, or a result that does not belong to it.
+        TorchCRFScanError: a bag that rosbags cannot read, or a result that does not belong to it.
     """
     from rosbags.highlevel import AnyReader
 
@@ -140,16 +140,11 @@ def blank(message: Any, moving: Bools) -> Any:
     """A scan's message with NaN where a beam hit something that moves."""
     if message.__msgtype__ == LASER:
         return replace(message, ranges=np.where(moving, np.float32(np.nan), message.ranges).astype(np.float32))
-    order = ">" if message.is_bigendian else "<"
-    fields = {field.name: (f"{order}{TYPES[field.datatype]}", field.offset) for field in message.fields if field.name in XYZ}
-    layout = np.dtype(
-        {"names": list(fields), "formats": [f for f, _ in fields.values()], "offsets": [o for _, o in fields.values()],
-         "itemsize": message.point_step}
-    )  # fmt: skip
+    layout = point_layout(message)
     data = np.array(message.data, dtype=np.uint8)
     for row, hit in zip(data.reshape(message.height, message.row_step), moving.reshape(message.height, message.width), strict=True):
         points = row[: message.width * message.point_step].view(layout)
-        for name in fields:
+        for name in XYZ & set(layout.names or ()):
             points[name][hit] = np.nan
     return replace(message, data=data)
 

@@ -13,7 +13,7 @@ import numpy as np
 from torchcrf_scan.data.carmen_line import GEOMETRY, LaserLine, kind_of, read_laser_line
 from torchcrf_scan.data.carmen_survey import Survey, survey
 from torchcrf_scan.data.options import ReadOptions
-from torchcrf_scan.data.text_lines import GZIP, Line, read_lines
+from torchcrf_scan.data.text_lines import Line, is_gzipped, read_lines
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.result import ScanResult
 from torchcrf_scan.scan import Bools
@@ -35,12 +35,10 @@ def writing_clean_carmen(source: Path, target: Path, options: ReadOptions) -> It
     Args:
         options: with which the source was read.
     """
-    with open(source, "rb") as original:
-        is_packed = original.read(len(GZIP)) == GZIP
     known, lines = survey(source, options), read_lines(source)
     with whole_file(target) as raw, ExitStack() as stack:
         file: Any = raw
-        if is_packed:
+        if is_gzipped(source):
             file = stack.enter_context(gzip.GzipFile(fileobj=raw, mode="wb", filename="", mtime=0))
 
         def put(text: str) -> None:

@@ -10,7 +10,7 @@ from torchcrf_scan.data.clean_bag import writing_clean_bag
 from torchcrf_scan.data.clean_carmen import writing_clean_carmen
 from torchcrf_scan.data.formats import find_format
 from torchcrf_scan.data.options import ReadOptions
-from torchcrf_scan.data.text_lines import GZIP
+from torchcrf_scan.data.text_lines import is_gzipped
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.result import ScanResult
 
@@ -22,12 +22,11 @@ def clean_name(source: Path) -> str:
     """The name of the clean recording of a source: a log, a bag, or a folder of ROS 2.
 
     Raises:
-        ValueError: a format that is not written.
+        TorchCRFScanError: a format that is not written.
     """
     form = find_format(source)
     if form is not None and form.name == TEXT:
-        with open(source, "rb") as file:
-            return f"{LOG}.gz" if file.read(len(GZIP)) == GZIP else LOG
+        return f"{LOG}.gz" if is_gzipped(source) else LOG
     if form is not None and form.name in BAGS:
         return "clean.bag" if form.name == BAGS[0] else "clean"
     raise TorchCRFScanError(f"--clean: expected a {TEXT} or a bag, got {source}, a {'file' if form is None else form.name}")

@@ -32,8 +32,8 @@ def read_csv_scans(path: str | Path, options: ReadOptions = AS_RECORDED) -> Iter
     """The scans of a CSV file, one row at a time.
 
     Raises:
-        ValueError: a first row of another layout; or, after every scan before it, a row that does not fit it (unless `on_bad`
-            takes it) or is cut, with line and byte.
+        TorchCRFScanError: a first row of another layout; or, after every scan before it, a row that does not fit it (unless
+            `on_bad` takes it) or is cut, with line and byte.
         OSError: the file cannot be opened.
     """
     lines = read_lines(Path(path))

@@ -28,7 +28,7 @@ class PairFiles(Sequence[ScanPair]):
         paths: the files.
 
     Raises:
-        ValueError: no pattern, or one without matches; indexing also raises the errors of `read_pair`.
+        TorchCRFScanError: no pattern, or one without matches; indexing also raises the errors of `read_pair`.
     """
 
     def __init__(self, *patterns: str | Path) -> None:
@@ -88,7 +88,7 @@ def split_by_sequence(pairs: Sequence[ScanPair], held_out: int | float, seed: in
         (train, test), each in the order of `pairs`, neither empty.
 
     Raises:
-        ValueError: fewer than two recordings, or a number or share that leaves one side empty.
+        TorchCRFScanError: fewer than two recordings, or a number or share that leaves one side empty.
     """
     sizes = Counter(pair.sequence for pair in pairs)
     if len(sizes) < 2:

@@ -108,7 +108,7 @@ def simulate_drive(config: SimulatorConfig, scans: int, seed: int) -> Drive:
     new ones. `worlds.every` changes the time between scans. The same arguments give the same bytes.
 
     Raises:
-        ValueError: fewer than two scans, or a negative seed.
+        TorchCRFScanError: fewer than two scans, or a negative seed.
     """
     if scans < 2:
         raise TorchCRFScanError(f"scans: expected at least 2, got {scans}")

@@ -44,7 +44,7 @@ class Format:
     options: tuple[str, ...] = ("topic", "odometry", "no_return")
 
     def check(self, path: str | Path, options: ReadOptions) -> None:
-        """Raises ValueError for an option that has no meaning in this format; `auto` odometry is what comes with the scans."""
+        """Raises TorchCRFScanError for an option without meaning in this format; `auto` odometry is what comes with the scans."""
         for name in ("topic", "odometry", "no_return"):
             value = getattr(options, name)
             if name not in self.options and value not in (None, AUTO):
@@ -119,7 +119,7 @@ def read_scans(
     """The scans of a recording in any format, one at a time; the options are those of `ReadOptions`.
 
     Raises:
-        ValueError: another format, or what its reader says; of a damaged or cut file after every scan before the fault, with
+        TorchCRFScanError: another format, or what its reader says; of a damaged or cut file after every scan before the fault, with
             its place.
         OSError: the file cannot be opened.
     """
@@ -131,7 +131,7 @@ def read_recording(path: str | Path, options: ReadOptions = AS_RECORDED) -> Reco
     """The pairs of consecutive scans of a recording in any format; `on_bad` is told once of what is left out.
 
     Raises:
-        ValueError: another format, a file that cannot be read, or fewer than two scans.
+        TorchCRFScanError: another format, a file that cannot be read, or fewer than two scans.
         OSError: the file cannot be opened.
     """
     read, quiet = _reader(path, options), replace(options, on_bad=options.on_bad and _ignore)

@@ -13,6 +13,6 @@ MOST_ARCHIVE = 1 << 26  # bytes of the archive, whose directory is read whole
 
 
 def check_beams(count: int, where: str) -> None:
-    """Raises ValueError for more beams than `MOST_BEAMS`; where: file and place."""
+    """Raises TorchCRFScanError for more beams than `MOST_BEAMS`; where: file and place."""
     if count > MOST_BEAMS:
         raise TorchCRFScanError(f"{where}: expected at most {MOST_BEAMS} beams, got {count}")

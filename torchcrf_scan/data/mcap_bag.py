@@ -11,8 +11,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, type_name, unpack
-from torchcrf_scan.data.limits import MOST_CHUNK
+from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, read_exactly, type_name, unpack
 from torchcrf_scan.errors import TorchCRFScanError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -27,7 +26,7 @@ class McapBag:
         self.path = path
 
     def topics(self) -> list[Topic]:
-        """The topics by the file's summary, or by its records if it has none; raises ValueError if none of them is whole."""
+        """The topics by the file's summary, or by its records if it has none; raises TorchCRFScanError if none of them is whole."""
         found = _Channels()
         with open(self.path, "rb") as file:
             for start in (self._summary(file), len(MAGIC)):
@@ -58,7 +57,7 @@ class McapBag:
         """The messages of some topics in the order of the file.
 
         Raises:
-            ValueError: a damaged or cut record, with its offset, after all messages before it.
+            TorchCRFScanError: a damaged or cut record, with its offset, after all messages before it.
         """
         with open(self.path, "rb") as file:
             try:
@@ -117,8 +116,8 @@ def _read_message(kind: int, data: bytes, found: _Channels, offset: int) -> Iter
 
 
 def _read_record(file: BinaryIO) -> tuple[int, bytes]:
-    head = _exactly(file, 9)
-    return head[0], _exactly(file, int(struct.unpack("<Q", head[1:])[0]))
+    head = read_exactly(file, 9)
+    return head[0], read_exactly(file, int(struct.unpack("<Q", head[1:])[0]))
 
 
 def _unpack(data: bytes) -> bytes:
@@ -128,18 +127,9 @@ def _unpack(data: bytes) -> bytes:
     file.seek(28)
     compression = _string(file)
     (length,) = struct.unpack("<Q", file.read(8))
-    return unpack(_exactly(file, length), compression, size)
+    return unpack(read_exactly(file, length), compression, size)
 
 
 def _string(file: BinaryIO) -> str:
-    (size,) = struct.unpack("<I", _exactly(file, 4))
-    return _exactly(file, size).decode(errors="replace")
-
-
-def _exactly(file: BinaryIO, size: int) -> bytes:
-    if size > MOST_CHUNK:
-        raise TorchCRFScanError(f"expected parts of at most {MOST_CHUNK} bytes, got {size}")
-    data = file.read(size)
-    if len(data) != size:
-        raise EOFError(f"{len(data)} of {size} bytes")
-    return data
+    (size,) = struct.unpack("<I", read_exactly(file, 4))
+    return read_exactly(file, size).decode(errors="replace")

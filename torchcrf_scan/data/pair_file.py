@@ -70,7 +70,7 @@ class _Fields:
         return array.astype(dtype, order="C")
 
     def require(self, key: str, values: NDArray[Any], is_right: NDArray[Any] | bool, expected: str) -> None:
-        """Raises ValueError for the first entry of `values` that is not right."""
+        """Raises TorchCRFScanError for the first entry of `values` that is not right."""
         wrong = np.argwhere(~np.asarray(is_right))
         if len(wrong):
             where = tuple(int(i) for i in wrong[0])
@@ -107,7 +107,7 @@ def read_pair(path: str | Path) -> ScanPair:
     annotation are not read.
 
     Raises:
-        ValueError: not an `.npz`, truncated, object arrays, a key that is missing or wrong (the message names it).
+        TorchCRFScanError: not an `.npz`, truncated, object arrays, a key that is missing or wrong (the message names it).
         OSError: the file cannot be opened.
     """
     return _parse_pair(_Fields(Path(path), read_arrays(Path(path), _PAIR_KEYS)))
@@ -120,7 +120,7 @@ def write_pair(path: str | Path, pair: ScanPair) -> None:
     pair's name is not written, it is the file's; nor are times of beams and an initial motion.
 
     Raises:
-        ValueError: a pair that `read_pair` would reject, or scans of different sensors. No file is written.
+        TorchCRFScanError: a pair that `read_pair` would reject, or scans of different sensors. No file is written.
     """
     fields = _Fields(Path(path), _pair_arrays(Path(path), pair))
     _parse_pair(fields)
@@ -141,7 +141,7 @@ def read_prediction(path: str | Path) -> PairPrediction:
     """Reads a prediction file.
 
     Raises:
-        ValueError: not an `.npz`, truncated, object arrays, a key that is missing or wrong (the message names it).
+        TorchCRFScanError: not an `.npz`, truncated, object arrays, a key that is missing or wrong (the message names it).
         OSError: the file cannot be opened.
     """
     return _parse_prediction(_Fields(Path(path), read_arrays(Path(path), (*_PREDICTION_KEYS, *_CERTAINTY_KEYS))))
@@ -151,7 +151,7 @@ def write_prediction(path: str | Path, prediction: PairPrediction) -> None:
     """Writes a prediction file.
 
     Raises:
-        ValueError: a prediction that `read_prediction` would reject. No file is written.
+        TorchCRFScanError: a prediction that `read_prediction` would reject. No file is written.
     """
     keys = [key for key in (*_PREDICTION_KEYS, *_CERTAINTY_KEYS) if getattr(prediction, key) is not None]
     fields = _Fields(Path(path), {key: np.asarray(getattr(prediction, key), order="C") for key in keys})

@@ -15,7 +15,7 @@ from torchcrf_scan.data.stamps import steps_with_a_word
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.safe_names import check_name
-from torchcrf_scan.scan import Floats, ScanPair
+from torchcrf_scan.scan import FARTHEST, Floats, ScanPair
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ class Recording(Sequence[ScanPair]):
         fault: what ended the reading before the end of the file; None: nothing.
 
     Raises:
-        ValueError: fewer than two scans, or a name with control characters.
+        TorchCRFScanError: fewer than two scans, or a name with control characters.
     """
 
     def __init__(self, path: str | Path, read: Read, again: Read | None = None) -> None:
@@ -110,8 +110,12 @@ def log_name(path: Path) -> str:
 
 
 def motions_between(odometry: Sequence[Floats | None]) -> list[Floats | None]:
-    """(S-1) motions `T_target_source` between S poses of the sensor; None where one is unknown, or if all are the same."""
+    """(S-1) motions `T_target_source` between S poses of the sensor.
+
+    None where one is unknown, where the sensor cannot have gone so far, or if all are the same.
+    """
     known = [pose for pose in odometry if pose is not None]
     if not known or all(np.array_equal(pose, known[0]) for pose in known):
         return [None] * (len(odometry) - 1)
-    return [None if a is None or b is None else se2.compose(se2.inverse(b), a) for a, b in pairwise(odometry)]
+    motions = [None if a is None or b is None else se2.compose(se2.inverse(b), a) for a, b in pairwise(odometry)]
+    return [motion if motion is not None and (np.abs(motion) <= FARTHEST).all() else None for motion in motions]

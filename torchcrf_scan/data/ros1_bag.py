@@ -11,8 +11,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, type_name, unpack
-from torchcrf_scan.data.limits import MOST_CHUNK
+from torchcrf_scan.data.bag_records import DAMAGES, Message, Topic, read_exactly, type_name, unpack
 from torchcrf_scan.errors import TorchCRFScanError
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -28,7 +27,7 @@ class Ros1Bag:
         self.path = path
 
     def topics(self) -> list[Topic]:
-        """The topics by the bag's index, or by its records if it has none; raises ValueError if none of them is whole."""
+        """The topics by the bag's index, or by its records if it has none; raises TorchCRFScanError if none of them is whole."""
         connections: dict[int, Topic] = {}
         with open(self.path, "rb") as file:
             try:
@@ -62,7 +61,7 @@ class Ros1Bag:
         """The messages of some topics in the order of the file.
 
         Raises:
-            ValueError: a damaged or cut record, with its offset, after all messages before it.
+            TorchCRFScanError: a damaged or cut record, with its offset, after all messages before it.
         """
         connections: dict[int, Topic] = {}
         with open(self.path, "rb") as file:
@@ -125,17 +124,8 @@ def _read_record(file: BinaryIO) -> tuple[Fields, bytes]:
 
 def _sized(file: BinaryIO) -> bytes:
     """Bytes behind their number."""
-    (size,) = struct.unpack("<L", _exactly(file, 4))
-    if size > MOST_CHUNK:
-        raise TorchCRFScanError(f"expected at most {MOST_CHUNK} bytes, got {size}")
-    return _exactly(file, size)
-
-
-def _exactly(file: BinaryIO, size: int) -> bytes:
-    data = file.read(size)
-    if len(data) != size:
-        raise EOFError(f"{len(data)} of {size} bytes")
-    return data
+    (size,) = struct.unpack("<L", read_exactly(file, 4))
+    return read_exactly(file, size)
 
 
 def _fields(data: bytes) -> Fields:

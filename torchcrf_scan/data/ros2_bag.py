@@ -38,7 +38,7 @@ class SqliteBag:
         return closing(base)
 
     def topics(self) -> list[Topic]:
-        """The topics of the database. Raises ValueError if it cannot be read."""
+        """The topics of the database. Raises TorchCRFScanError if it cannot be read."""
         with self._open() as base:
             try:
                 _check_tables(base)
@@ -60,7 +60,7 @@ class SqliteBag:
         """The messages of some topics as recorded.
 
         Raises:
-            ValueError: a damaged or cut database, with the row, after all messages before it.
+            TorchCRFScanError: a damaged or cut database, with the row, after all messages before it.
         """
         topics = {topic.name: topic for topic in self.topics()}
         stored = "messages.id, CAST(name AS TEXT), CAST(timestamp AS INTEGER), CAST(data AS BLOB)"
@@ -76,7 +76,7 @@ class SqliteBag:
 
 
 def _check_tables(base: sqlite3.Connection) -> None:
-    """Raises ValueError for views and triggers: a bag has none, and they may compute for ever."""
+    """Raises TorchCRFScanError for views and triggers: a bag has none, and they may compute for ever."""
     found = base.execute("SELECT name FROM sqlite_master WHERE type NOT IN ('table', 'index')").fetchone()
     if found:
         raise TorchCRFScanError(f"the view or trigger {found[0]!r}")
@@ -86,7 +86,7 @@ class FolderBag:
     """A folder of ROS 2: its files one after the other, as `metadata.yaml` lists them; without it, by name.
 
     Raises:
-        ValueError: damaged metadata, files that are missing, of another format, or packed as a whole.
+        TorchCRFScanError: damaged metadata, files that are missing, of another format, or packed as a whole.
     """
 
     def __init__(self, path: Path) -> None:
@@ -102,7 +102,7 @@ class FolderBag:
         return list({topic.name: topic for part in self._parts for topic in part.topics()}.values())
 
     def messages(self, names: Collection[str]) -> Iterator[Message]:
-        """The messages of some topics as recorded; raises ValueError at a fault, as its files do."""
+        """The messages of some topics as recorded; raises TorchCRFScanError at a fault, as its files do."""
         for part in self._parts:
             for message in part.messages(names):
                 yield replace(message, is_packed=self._is_packed)

@@ -28,8 +28,8 @@ def read_bag(bag: Bag, options: ReadOptions = AS_RECORDED) -> Iterator[Reading]:
     """The scans of one topic of a bag as recorded, with the stamps of their headers (of the recording where these are 0).
 
     Raises:
-        ValueError: no topic with scans, several and none chosen, or rosbags missing; or, after every scan before it, a message
-            that cannot be read (unless `on_bad` takes it) or a damaged file, with its place.
+        TorchCRFScanError: no topic with scans, several and none chosen, or rosbags missing; or, after every scan before it, a
+            message that cannot be read (unless `on_bad` takes it) or a damaged file, with its place.
         OSError: the file cannot be opened.
     """
     topics = bag.topics()
@@ -100,7 +100,7 @@ class _Reader:
         self._scan_of, self._no_return = SCANS[scans.type], no_return
 
     def decode(self, message: Message) -> Any:
-        """The message as an object; raises ValueError with its place."""
+        """The message as an object; raises TorchCRFScanError with its place."""
         try:
             data = unpack_message(message.data) if message.is_packed else message.data
             deserialize = self._store.deserialize_cdr if message.topic.is_cdr else self._store.deserialize_ros1
@@ -143,7 +143,7 @@ def _with_odometry(
 
 
 def _typestore(bag: Bag, topics: list[Topic], is_cdr: bool) -> Typestore:
-    """The types that the bag defines, and those of ROS where it does not; raises ValueError without rosbags."""
+    """The types that the bag defines, and those of ROS where it does not; raises TorchCRFScanError without rosbags."""
     try:
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     except ImportError as error:

@@ -51,7 +51,7 @@ def laser_scan(message: Any, no_return: float) -> Scan:
 
 
 def cloud_scan(message: Any, no_return: float) -> Scan:
-    """The scan of a planar PointCloud2, a beam for every point; raises ValueError for one that is not planar.
+    """The scan of a planar PointCloud2, a beam for every point; raises TorchCRFScanError for one that is not planar.
 
     no_return: metres; points from there on are beams without return.
     """
@@ -76,14 +76,17 @@ def _points(message: Any) -> np.ndarray:
     """(P,) records of a cloud."""
     width, height, step = int(message.width), int(message.height), int(message.point_step)
     check_beams(width * height, "points")
-    order = ">" if message.is_bigendian else "<"
-    fields = {field.name: (order + TYPES[field.datatype], int(field.offset)) for field in message.fields if field.datatype in TYPES}
-    form = np.dtype(
-        {"names": list(fields), "formats": [f for f, _ in fields.values()], "offsets": [o for _, o in fields.values()],
-         "itemsize": step}
-    )  # fmt: skip
     rows = np.asarray(message.data, dtype=np.uint8).reshape(height, -1)[:, : width * step]
-    return np.frombuffer(rows.tobytes(), dtype=form, count=width * height)
+    return np.frombuffer(rows.tobytes(), dtype=point_layout(message), count=width * height)
+
+
+def point_layout(message: Any) -> np.dtype:
+    """The fields of a point of a cloud."""
+    order = ">" if message.is_bigendian else "<"
+    fields = {field.name: field for field in message.fields if field.datatype in TYPES}  # padding has one name several times
+    formats = [order + TYPES[field.datatype] for field in fields.values()]
+    offsets = [int(field.offset) for field in fields.values()]
+    return np.dtype({"names": [*fields], "formats": formats, "offsets": offsets, "itemsize": int(message.point_step)})
 
 
 def _times(points: np.ndarray) -> Floats | None:

@@ -126,9 +126,7 @@ class _Drive:
         edges = np.linspace(0, config.beams, SWEEP_PARTS + 1).round().astype(int)
         edges = edges[np.append(True, np.diff(edges) > 0)]
         late = config.sweep * ((edges[:-1] + edges[1:]) / (2 * config.beams) - 0.5)
-        onwards = se2.compose(
-            se2.inverse(self.path[step]), self.path[step + 1]
-        )  # at this speed; at that of the last step, at the end
+        onwards = se2.compose(se2.inverse(self.path[step]), self.path[step + 1])  # the last step goes on at the end
         poses = se2.compose(np.broadcast_to(self.path[i], (len(late), 3)), late[:, None] / config.dt * onwards)
         return [Part(slice(a, b), *of) for (a, b), *of in zip(pairwise(edges), late.tolist(), poses, strict=True)]
 
@@ -216,7 +214,7 @@ def simulate_pairs(config: SimulatorConfig, pairs: int, sequences: int, seed: in
     same bytes.
 
     Raises:
-        ValueError: fewer than one pair, no drive or more drives than pairs, a negative seed.
+        TorchCRFScanError: fewer than one pair, no drive or more drives than pairs, a negative seed.
     """
     if pairs < 1:
         raise TorchCRFScanError(f"pairs: expected at least 1, got {pairs}")

@@ -31,7 +31,7 @@ def plausible_steps(stamps: Floats) -> tuple[Floats, Bools]:
         steps = np.diff(np.asarray(stamps, dtype=np.float64))
     forward = np.isfinite(steps) & (steps > 0) & (steps < LONGEST)
     standing = steps == 0
-    if standing.mean() > STANDING if len(steps) else False:
+    if len(steps) and standing.mean() > STANDING:
         elapsed = steps[forward].sum() / max(int((forward | standing).sum()), 1)
         return np.full(len(steps), _bounded(elapsed)), np.ones(len(steps), dtype=bool)
     usual = float(np.median(steps[forward])) if forward.any() else 0.0

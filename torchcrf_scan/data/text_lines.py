@@ -39,7 +39,7 @@ def read_lines(path: Path) -> Iterator[Line]:
     """The lines of a text file, one at a time.
 
     Raises:
-        ValueError: after the last whole line, where the file is damaged, cut, binary, or has a line beyond `MOST_LINE`.
+        TorchCRFScanError: after the last whole line, where the file is damaged, cut, binary, or has a line beyond `MOST_LINE`.
         OSError: it cannot be opened.
     """
     number, offset = 1, 0
@@ -49,11 +49,15 @@ def read_lines(path: Path) -> Iterator[Line]:
             number, offset = number + 1, offset + len(raw)
 
 
-def open_unpacked(path: Path) -> IO[bytes]:
-    """The file's contents, unpacked if its first bytes say gzip."""
+def is_gzipped(path: Path) -> bool:
+    """Whether a file's first bytes are those of gzip."""
     with open(path, "rb") as file:
-        is_packed = file.read(len(GZIP)) == GZIP
-    return gzip.open(path) if is_packed else open(path, "rb")  # type: ignore[return-value]
+        return file.read(len(GZIP)) == GZIP
+
+
+def open_unpacked(path: Path) -> IO[bytes]:
+    """The file's contents, unpacked if it is gzipped."""
+    return gzip.open(path) if is_gzipped(path) else open(path, "rb")  # type: ignore[return-value]
 
 
 def _next_line(file: IO[bytes], path: Path, number: int, offset: int) -> bytes:

@@ -22,6 +22,7 @@ from torchcrf_scan.scan import Floats, Ints
 from torchcrf_scan.whole_file import whole_file
 
 COLUMNS = ("stamp", "id", "x", "y", "heading", "vx", "vy", "length", "width", "points")
+LARGEST = 1 << 63  # what 64 bits hold, and far beyond any field
 WHOLE = ("id", "points")  # columns of whole numbers
 Write = Callable[[float, Iterable[MovingObject]], None]
 
@@ -75,7 +76,7 @@ def read_tracks(path: str | Path) -> TrackTable:
     """Reads a file of tracks. Further columns are ignored.
 
     Raises:
-        ValueError: a missing column, a line that is too short, or a field that is not a number; names file and line.
+        TorchCRFScanError: a missing column, a line that is too short, or a field that is not a number; names file and line.
         OSError: the file cannot be opened.
     """
     try:
@@ -105,7 +106,7 @@ def _fields(line: list[str], places: list[int], where: str) -> list[float | int]
             value = kind(line[place])
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
+        if not abs(value) < LARGEST:
             raise TorchCRFScanError(
                 f"{where}: {name}: expected a {'whole' if kind is int else 'finite'} number, got {line[place]!r}"
             )

@@ -66,7 +66,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     """Reads TUM lines; empty lines and comments (#) are left out, and z is not read.
 
     Raises:
-        ValueError: a line that is not eight finite numbers, or whose rotation is not about z; names file and line.
+        TorchCRFScanError: a line that is not eight finite numbers, or whose rotation is not about z; names file and line.
         OSError: the file cannot be opened.
     """
     try:

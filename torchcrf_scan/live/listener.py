@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from torchcrf_scan.data.ros_messages import laser_scan, planar_pose, stamp_of
 from torchcrf_scan.live import messages
 from torchcrf_scan.live.network import Bell, Connection
 from torchcrf_scan.live.types import LASER, MARKERS, OBSTACLES, ODOMETRY
-from torchcrf_scan.result import ScanResult
-from torchcrf_scan.scan import Floats, Scan
+from torchcrf_scan.result import ScanResult, Stream
+from torchcrf_scan.scan import Floats
 
 log = logging.getLogger(__name__)
 
@@ -30,13 +30,6 @@ OUTPUTS = {  # name of a topic behind the prefix -> its type
 }
 PAUSE = 0.2  # seconds between looks whether to stop
 FAR_OFF = 60.0  # seconds; a latency beyond that is a clock of another machine
-
-
-class Stream(Protocol):
-    """What answers: `torchcrf_scan.stream.stream.ScanStream`, or anything with its `feed`."""
-
-    def feed(self, scan: Scan, stamp: float, odometry: Floats | None = None) -> ScanResult:
-        """What is known after one more scan."""
 
 
 @dataclass(frozen=True, slots=True)

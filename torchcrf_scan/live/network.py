@@ -31,7 +31,7 @@ class Network:
 
     @property
     def number(self) -> int:
-        """The number of the domain; raises ValueError if it is none from 0 to 232."""
+        """The number of the domain; raises TorchCRFScanError if it is none from 0 to 232."""
         told = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0" if self.domain is None else str(self.domain)
         if not (told.isdecimal() and int(told) <= 232):
             raise TorchCRFScanError(f"domain: expected a number from 0 to 232, got {told}")
@@ -56,7 +56,7 @@ class Connection:
     """A participant in a domain.
 
     Raises:
-        ValueError: cyclonedds is missing, or refuses the network.
+        TorchCRFScanError: cyclonedds is missing, or refuses the network.
     """
 
     def __init__(self, network: Network) -> None:
@@ -93,7 +93,7 @@ class Connection:
 
 
 def dds_name(topic: str) -> str:
-    """The name by which DDS knows a topic of ROS 2: /scan is rt/scan. Raises ValueError if it is no name of a topic."""
+    """The name by which DDS knows a topic of ROS 2: /scan is rt/scan. Raises TorchCRFScanError if it is no name of a topic."""
     parts = topic.strip("/").split("/")
     if not all(part.isidentifier() and part.isascii() for part in parts):
         raise TorchCRFScanError(f"topic: expected a name like /scan, got {topic!r}")

@@ -24,7 +24,7 @@ NUMBERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint
 
 @cache
 def typestore() -> Typestore:
-    """The definitions; raises ValueError without rosbags."""
+    """The definitions; raises TorchCRFScanError without rosbags."""
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:

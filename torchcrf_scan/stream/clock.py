@@ -22,11 +22,11 @@ class Clock:
         warns: says in the log when a stamp is not later than the one before, once.
 
     Attributes:
-        now: seconds since the first scan, a whole number of ticks.
+        now: seconds since the first scan, a whole number of ticks. elapsed: the same, not rounded.
     """
 
     def __init__(self, *, warns: bool = True) -> None:
-        self.now = 0.0
+        self.now = self.elapsed = 0.0
         self._last = math.nan
         self._intervals: deque[float] = deque(maxlen=REMEMBERED)
         self._has_started, self._has_warned = False, not warns
@@ -45,15 +45,14 @@ class Clock:
         """Seconds since the scan before, above 0; 0 at the first scan. stamp: seconds, of the new scan."""
         since = stamp - self._last
         is_later = SHORTEST <= since < LONGEST  # false for what is not a number
-        interval = round((since if is_later else self.usual) * TICKS) / TICKS
-        if not self._has_started:
-            interval = 0.0
-        elif is_later:
+        exact = (since if is_later else self.usual) if self._has_started else 0.0
+        interval = round(exact * TICKS) / TICKS
+        if is_later:
             self._intervals.append(since)
         elif not self._has_warned and not math.isnan(self._last):
             self._has_warned = True
             log.warning("stamp %s after %s: expected a later one; taken as %.3g s later", stamp, self._last, interval)
         self._has_started = True
         self._last = stamp if math.isfinite(stamp) else math.nan
-        self.now += interval
+        self.now, self.elapsed = self.now + interval, self.elapsed + exact
         return interval

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchcrf_scan.beams import number, vector
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.model import JointScanCRF
@@ -90,10 +91,12 @@ class ScanStream:
                 before is the first guess. None, not finite or gone faster than `FASTEST`: constant velocity.
 
         Raises:
-            ValueError: odometry of another shape.
+            TorchCRFScanError: no scan, a stamp that is no number, or odometry of another shape.
         """
-        if odometry is not None and np.shape(odometry) != (3,):
-            raise TorchCRFScanError(f"odometry: expected three numbers (theta, x, y), got shape {np.shape(odometry)}")
+        if not isinstance(scan, Scan):
+            raise TorchCRFScanError(f"scan: expected a Scan, got {type(scan).__name__}")
+        stamp = number("stamp", stamp, "seconds")
+        odometry = None if odometry is None else vector("odometry", odometry, 3)
         interval = self._advance(scan, stamp)
         predicted = self._predict(interval, odometry)
         if len(scan) < FEWEST_POINTS:
@@ -141,8 +144,8 @@ class ScanStream:
         """(3,) the pose `interval` seconds after the last one, by odometry or constant velocity; after a gap where it was."""
         before, self._odometry, self._is_led = self._odometry, None, False
         if odometry is not None and np.isfinite(odometry).all():
-            self._odometry = np.asarray(odometry, dtype=np.float64)
-            step = None if before is None else _step(before, self._odometry, interval)
+            self._odometry = odometry
+            step = None if before is None else _step(before, odometry, interval)
             self._is_led = step is not None
             if step is not None:
                 return se2.compose(self._pose, step)
@@ -247,7 +250,7 @@ class ScanStream:
         """The answer, at the time of the scan's first beam."""
         return ScanResult(
             scan=deskewed(scan, self._twist) if self._late > 0 else scan,
-            stamp=float(stamp),
+            stamp=stamp,
             pose=se2.compose(self._pose, twist.exp(-self._late * self._twist)),
             covariance=self._covariance.copy(),
             twist=self._twist.copy(),

@@ -98,7 +98,7 @@ class Tracker:
             (K,) the number of each mover's track, 0 for a mover without points, and the confirmed objects by number.
 
         Raises:
-            ValueError: a stamp or points that are not finite, shapes that do not fit each other, clusters beyond K.
+            TorchCRFScanError: a stamp or points that are not finite, shapes that do not fit each other, clusters beyond K.
         """
         points, cluster, velocities, covariances = _checked(stamp, points, cluster, velocities, covariances)
         rates = np.zeros(len(velocities)) if turns is None else np.asarray(turns, dtype=np.float64)
