@@ -17,7 +17,7 @@ from torchcrf_scan.scan import Annotation, PairPrediction, Scan, ScanPair
 from torchcrf_scan.stream.config import StreamConfig
 from torchcrf_scan.stream.stream import ScanStream
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 __all__ = [
     "Annotation",

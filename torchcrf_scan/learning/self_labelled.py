@@ -88,9 +88,9 @@ def label_readings(model: JointScanCRF, readings: Iterable[Reading], most: int, 
         result = stream.feed(reading.scan, reading.stamp)
         if result.status != "ok":
             seen.clear()
-        elif not seen or clock.now - seen[-1].time >= (1 - EARLY) * seconds:
+        elif not seen or clock.elapsed - seen[-1].time >= (1 - EARLY) * seconds:
             track = result.track[result.scan.beam]
-            seen.append(Seen(result, grid_at(result.scan, result.scan.points), track, clock.now))
+            seen.append(Seen(result, grid_at(result.scan, result.scan.points), track, clock.elapsed))
         else:
             continue
         if len(seen) < SCANS:
