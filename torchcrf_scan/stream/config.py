@@ -15,14 +15,14 @@ class StreamConfig:
     Attributes:
         lag: seconds; a scan is matched to the newest one that is at least so much older: in less time nothing moves visibly.
         history: number of scans kept to match to.
-        keyframe_share: a keyframe is replaced when it explains less than this share of a scan's background (half of it suffices
-            while the sensor stands where it was taken),
-        keyframe_distance: or is this many metres away,
-        keyframe_turn: or this many radians.
+        keyframe_share: a keyframe is replaced when it explains less than this share of a scan's background; half of it suffices
+            while the sensor stands where it was taken.
+        keyframe_distance: metres from its keyframe at which the sensor takes a new one.
+        keyframe_turn: radians from its keyframe at which the sensor takes a new one.
         least_share: of the returns that a motion must explain; otherwise the scan is not placed.
         gap: seconds without a placed scan after which the stream starts anew from the predicted pose.
-        memory: number of earlier scans asked what they saw where a point lies now,
-        memory_spacing: and seconds between them.
+        memory: number of earlier scans asked what they saw where a point lies now.
+        memory_spacing: seconds between those scans, at least.
         least_speed: metres per second, below which nothing counts as a moving object.
         deskew: scans with beam times are corrected for the motion during their sweep.
     """
