@@ -13,12 +13,15 @@ from pathlib import Path
 import atheris
 import numpy as np
 
-with atheris.instrument_imports(include=["torchcrf_scan.data", "torchcrf_scan.checks", "torchcrf_scan.scan", "rosbags"]):
+LOOKED_AT = ["torchcrf_scan.data", "torchcrf_scan.checks", "torchcrf_scan.scan", "torchcrf_scan.beams", "rosbags"]
+
+with atheris.instrument_imports(include=LOOKED_AT):
     import rosbags.rosbag1
     import rosbags.rosbag2  # noqa: F401  imported when bags are read, and instrumented only here
-    from small_files import POSES, TRACKS, bags, carmen, csv, pair_bytes, prediction_bytes
+    from mutants import assert_finite, model
+    from small_files import PAIR, POSES, TRACKS, bags, carmen, csv, pair_bytes, prediction_bytes
 
-    from torchcrf_scan import ScanPair, TorchCRFScanError
+    from torchcrf_scan import Scan, ScanPair, TorchCRFScanError
     from torchcrf_scan.data.formats import read_recording, read_scans
     from torchcrf_scan.data.pair_file import read_pair, read_prediction
     from torchcrf_scan.data.track_file import read_tracks
@@ -53,6 +56,20 @@ def use_config(path: Path) -> None:
     read_config(path.parent, {}, {})
 
 
+def use_numbers(path: Path) -> None:
+    """The numbers of two scans and of how they are taken, matched."""
+    values = np.fromfile(path)
+    (dt, angle_min, angle_increment, range_max, range_noise), ranges = np.append(values[:5], np.zeros(5))[:5].tolist(), values[5:]
+    geometry = {"angle_min": angle_min, "angle_increment": angle_increment, "range_max": range_max, "range_noise": range_noise}
+    scans = [Scan.from_ranges(part, **geometry) for part in np.array_split(ranges, 2)]
+    assert_finite(model().match(*scans, dt))
+
+
+def numbers() -> bytes:
+    scans = [scan.to_beams(scan.ranges, np.nan) for scan in (PAIR.source, PAIR.target)]
+    return np.concatenate([[PAIR.dt, -1.5, 0.05, 80.0, 0.01], *scans]).tobytes()
+
+
 READERS: dict[str, tuple[str, Callable[[Path], list[bytes]], Callable[[Path], object]]] = {  # file, what it begins with, its use
     "pair": ("pair.npz", lambda folder: [pair_bytes(folder)], lambda path: use_pair(read_pair(path))),
     "prediction": ("pair.npz", lambda folder: [prediction_bytes()], read_prediction),
@@ -63,11 +80,8 @@ READERS: dict[str, tuple[str, Callable[[Path], list[bytes]], Callable[[Path], ob
     "mcap": ("a.mcap", lambda folder: bags_of(folder, ".mcap"), use_log),
     "poses": ("poses.tum", lambda folder: [POSES], use_trajectory),
     "tracks": ("tracks.csv", lambda folder: [TRACKS], read_tracks),
-    "config": (
-        CONFIG,
-        lambda folder: [(find_weights("encoder") / CONFIG).read_bytes()],
-        lambda path: read_config(path.parent, {}, {}),
-    ),
+    "numbers": ("scans.bin", lambda folder: [numbers()], use_numbers),
+    "config": (CONFIG, lambda folder: [SETTINGS.read_bytes()], use_config),
 }
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+KINDS = ("pair", "prediction", "carmen", "csv", "ros1", "ros2", "mcap", "poses", "tracks", "numbers", "config")
 WORKER = Path(__file__).with_name("mutants.py")
 
 
@@ -29,7 +30,7 @@ def test_recorded_files_with_something_wrong_are_answered_or_refused(real_pairs_
 
 
 @pytest.mark.fuzz
-@pytest.mark.parametrize("kind", ["pair", "prediction", "carmen", "csv", "ros1", "ros2", "mcap", "poses", "tracks", "config"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_readers_answer_or_refuse_what_reaches_new_lines(kind: str, tmp_path: Path) -> None:
     pytest.importorskip("atheris", reason="atheris, which finds what reaches new lines, is not installed")
     runs, seed = os.environ.get("FUZZ_RUNS", "10000"), os.environ.get("FUZZ_SEED", "1")

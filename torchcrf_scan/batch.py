@@ -201,6 +201,9 @@ def initial_motion_of(pair: ScanPair) -> Floats:
     return np.zeros(3) if pair.initial_motion is None else pair.initial_motion
 
 
+LEAST_NOISE = 1e-9  # metres; without any, what only rounding tells apart would be told apart
+
+
 def range_noise_of(pair: ScanPair) -> float:
     """The sensor's range noise, metres; if unknown, estimated from the ranges.
 
@@ -208,7 +211,7 @@ def range_noise_of(pair: ScanPair) -> float:
     """
     stated = [scan.range_noise for scan in (pair.source, pair.target) if scan.range_noise is not None]
     if stated:
-        return max(stated)
+        return max(*stated, LEAST_NOISE)
     second = np.concatenate([np.diff(scan.ranges, n=2) for scan in (pair.source, pair.target)])
     if len(second) == 0:
         return 0.01

@@ -16,7 +16,7 @@ Bools = NDArray[np.bool_]
 REAL = "biuf"  # kinds of arrays of real numbers
 NUMBERS = f"{REAL}O"  # that are converted; objects one by one
 
-FARTHEST = 1e6  # metres; larger ranges are treated as invalid, as their squares would lose single precision
+NEAREST, FARTHEST = 1e-9, 1e6  # metres; other ranges are treated as invalid, as their squares would leave single precision
 FARTHEST_BEARING = 4 * np.pi  # radians; a sensor's own numbers stay within two turns
 LONGEST_SWEEP = 1e6  # seconds between the first beam and any other
 MOST_BEAMS = 20_000  # of a scan, above what sensors give; a pair of so many takes minutes

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchcrf_scan.beams import FARTHEST, MOST_BEAMS, Bools, Floats, Ints, bearings_of, check_sensor, number, times_of, vector
+from torchcrf_scan.beams import FARTHEST, MOST_BEAMS, NEAREST, Bools, Floats, Ints, bearings_of, check_sensor, number, times_of, vector
 from torchcrf_scan.errors import TorchCRFScanError
 
 BACKGROUND = 0
@@ -83,7 +83,7 @@ class Scan:
     ) -> Scan:
         """A scan from ranges and bearings, or from ranges, `angle_min` and `angle_increment` (negative: clockwise).
 
-        Beams may be in any order. Invalid returns (not finite, masked, not above max(range_min, 0), not below range_max - 0.05 m
+        Beams may be in any order. Invalid returns (not finite, masked, not above range_min or `NEAREST`, not below range_max - 0.05 m
         or `FARTHEST`) are dropped: REP 117, and what sensor_msgs/LaserScan says of its limits. An infinite range_max is no limit.
 
         Args:
@@ -102,7 +102,7 @@ class Scan:
         bearings = bearings_of(len(ranges), bearings, angle_min, angle_increment)
         after = times_of(len(ranges), time_increment, times)
         with np.errstate(invalid="ignore"):
-            valid = (ranges < FARTHEST) & (ranges > max(range_min or 0.0, 0.0))
+            valid = (ranges < FARTHEST) & (ranges > max(range_min or 0.0, NEAREST))
             if range_max is not None:
                 valid &= ranges < range_max - MAX_RANGE_MARGIN
         beam = np.flatnonzero(valid)
