@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import assert_close
 
+from torchcrf_scan import JointScanCRF
 from torchcrf_scan.batch import ScanPairBatch
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.loops.pair import pair_of_scans
@@ -82,6 +83,14 @@ def test_an_empty_scan_keeps_one_masked_point() -> None:
     assert not batch.target_mask.any()
     assert batch.range_noise.isfinite().all()
     assert (batch.range_noise > 0).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 5e-324, 1e-12])
+def test_without_noise_there_is_a_little_of_it(noise: float) -> None:
+    """Of points that only rounding tells apart a covariance would be no number."""
+    near = Scan(np.array([1e-200, 1e-170, 0.2, 0.7]), np.array([-1.0, -0.9, 0.0, 0.1]), np.arange(4), 4, range_noise=noise)
+    assert_close(ScanPairBatch.collate([ScanPair(near, near)], dtype=torch.float64).range_noise[0], 1e-9)
+    assert np.isfinite(JointScanCRF.from_pretrained().match(near, near).motions).all()
 
 
 def test_one_point() -> None:

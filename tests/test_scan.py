@@ -114,8 +114,8 @@ def test_a_scan_does_not_change() -> None:
 # --- numbers that no sensor gives ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", [1e6, 1e12, 1e20, 1e38, 1e39, 1e300, np.inf])
-def test_what_is_too_far_for_a_sensor_is_no_return(value: float) -> None:
+@pytest.mark.parametrize("value", [0.0, 5e-324, 1e-200, 1e-9, 1e6, 1e12, 1e20, 1e38, 1e39, 1e300, np.inf])
+def test_what_is_too_near_or_too_far_for_a_sensor_is_no_return(value: float) -> None:
     assert Scan.from_ranges([1.0, value, 2.0], [0.0, 0.1, 0.2]).beam.tolist() == [0, 2]
     assert len(Scan.from_ranges([value], [0.0])) == 0
 

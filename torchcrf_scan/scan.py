@@ -16,7 +16,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchcrf_scan.beams import FARTHEST, MOST_BEAMS, NEAREST, Bools, Floats, Ints, bearings_of, check_sensor, number, times_of, vector
+from torchcrf_scan.beams import (
+    FARTHEST,
+    MOST_BEAMS,
+    NEAREST,
+    Bools,
+    Floats,
+    Ints,
+    bearings_of,
+    check_sensor,
+    number,
+    times_of,
+    vector,
+)
 from torchcrf_scan.errors import TorchCRFScanError
 
 BACKGROUND = 0
