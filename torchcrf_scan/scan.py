@@ -95,8 +95,9 @@ class Scan:
     ) -> Scan:
         """A scan from ranges and bearings, or from ranges, `angle_min` and `angle_increment` (negative: clockwise).
 
-        Beams may be in any order. Invalid returns (not finite, masked, not above range_min or `NEAREST`, not below
-        range_max - 0.05 m or `FARTHEST`) are dropped: REP 117, and what sensor_msgs/LaserScan says of its limits. An infinite range_max is no limit.
+        Beams may be in any order. Invalid returns (not finite, masked, not above range_min or `NEAREST`, not below `FARTHEST` or
+        range_max - 0.05 m) are dropped: REP 117, and what sensor_msgs/LaserScan says of its limits. An infinite range_max is no
+        limit.
 
         Args:
             ranges: (N,) metres. bearings: (N,) radians, counter-clockwise positive.
