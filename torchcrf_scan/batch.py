@@ -226,9 +226,7 @@ def _collate_truth(pairs: Sequence[ScanPair], source_mask: Tensor, dtype: torch.
     for b, pair in enumerate(pairs):
         truth, beam, n = pair.annotation, pair.source.beam, len(pair.source)
         assert truth is not None
-        point_of_beam = np.full(pair.target.n_beams + 1, -1)  # the last entry maps -1 to -1
-        point_of_beam[pair.target.beam] = np.arange(len(pair.target))
-        association[b, :n] = point_of_beam[truth.association[beam]]
+        association[b, :n] = pair.target_points(truth.association)
         cluster[b, :n] = truth.cluster[beam]
         known[b, :n] = ~truth.ignore[beam]
         motions[b, : len(truth.motions)] = truth.motions

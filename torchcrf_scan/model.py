@@ -398,7 +398,7 @@ class JointScanCRF(nn.Module):
                 raise TorchCRFScanError("trace: expected a model whose start and rounds the loops compute, on a CPU, got another")
             batch = ScanPairBatch.collate(pairs, reference.dtype).without_truth().to(reference.device)
             prediction = self(batch, outlier_distance=outlier_distance)
-            return [prediction.pair(b, pair) for b, pair in enumerate(pairs)]
+            return prediction.of_pairs(pairs)
         scans = [pair_of_scans(pair, reference.dtype) for pair in pairs]
         score, surveys = score_of(self.hypothesis_score), None if record is None else list[Survey | None]()
         starts = start_pairs(scans, score, self.config.motions, expected, surveys)

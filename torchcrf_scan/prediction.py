@@ -124,6 +124,10 @@ class Prediction:
         uncertainty = self.uncertainty and self.uncertainty.scaled(factor)
         return replace(self, motions=scale_motions(self.motions, factor), uncertainty=uncertainty)
 
+    def of_pairs(self, pairs: Sequence[ScanPair]) -> list[PairPrediction]:
+        """Predictions by beam of the pairs that the batch was made of."""
+        return [self.pair(b, pair) for b, pair in enumerate(pairs)]
+
     def pair(self, b: int, pair: ScanPair) -> PairPrediction:
         """Prediction of pair b by beam, its movers numbered 1.. by falling size, without the vacuous ones."""
         n = len(pair.source)

@@ -227,6 +227,12 @@ class ScanPair:
                 )
             object.__setattr__(self, "initial_motion", guess)
 
+    def target_points(self, association: Ints) -> Ints:
+        """(N,) target point of every source point, -1 none. association: (n_beams,) target beam of every source beam."""
+        point_of_beam = np.full(self.target.n_beams + 1, OUTLIER)  # the last entry maps -1 to -1
+        point_of_beam[self.target.beam] = np.arange(len(self.target))
+        return point_of_beam[association[self.source.beam]]
+
 
 @dataclass(frozen=True, slots=True)
 class PairPrediction:

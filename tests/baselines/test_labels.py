@@ -4,7 +4,7 @@ import numpy as np
 from checks import check
 from rooms import EMPTY, HOLES, ONE
 
-from torchcrf_scan.baselines.labels import all_outliers, as_background, target_points, to_prediction
+from torchcrf_scan.baselines.labels import all_outliers, as_background, to_prediction
 from torchcrf_scan.scan import ScanPair
 
 PAIR = ScanPair(HOLES, HOLES)  # beams 0, 2, 3 and 5 are valid
@@ -27,7 +27,7 @@ def test_equal_sizes_keep_their_order() -> None:
 
 def test_target_points_is_the_way_back() -> None:
     association = np.array([3, -1, 1, 0])
-    assert target_points(PAIR, as_background(PAIR, association, MOTIONS[0]).association).tolist() == association.tolist()
+    assert PAIR.target_points(as_background(PAIR, association, MOTIONS[0]).association).tolist() == association.tolist()
 
 
 def test_all_outliers_of_empty_scans() -> None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchcrf_scan.annotate.fit import FOLLOWS, Scans, fit, search
-from torchcrf_scan.baselines.labels import target_points
 from torchcrf_scan.errors import TorchCRFScanError
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Annotation, Bools, Floats, Ints, PairPrediction
@@ -82,7 +81,7 @@ def annotated(scans: Scans, annotation: Annotation) -> Document:
     beam = scans.pair.source.beam
     body = np.where(annotation.cluster >= BACKGROUND, annotation.cluster, annotation.body)[beam]
     label = np.where(annotation.ignore[beam], UNKNOWN, body)
-    association = np.where(label >= BACKGROUND, target_points(scans.pair, annotation.association), FOLLOWS)
+    association = np.where(label >= BACKGROUND, scans.pair.target_points(annotation.association), FOLLOWS)
     motions = np.array(annotation.motions, np.float64)
     motions[BACKGROUND] = np.where(np.isnan(motions[BACKGROUND]), blank(scans).motions[0], motions[BACKGROUND])
     document = replace(blank(scans), label=label, motions=motions, mended=association, held=np.zeros(len(motions), dtype=bool))

@@ -9,7 +9,7 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
 from torchcrf_scan.baselines.cloud import fit_motion
-from torchcrf_scan.baselines.labels import all_outliers, target_points, to_prediction
+from torchcrf_scan.baselines.labels import all_outliers, to_prediction
 from torchcrf_scan.geometry import se2
 from torchcrf_scan.scan import BACKGROUND, OUTLIER, Floats, Ints, PairPrediction, ScanPair
 
@@ -30,7 +30,7 @@ def cluster_displacements(
         clusters: K, maximum number of groups (at most the number of distinct displacements).
         remove_motion: measure displacements relative to the background's motion of `matched`.
     """
-    association = target_points(pair, matched.association)  # (N,)
+    association = pair.target_points(matched.association)  # (N,)
     inliers = np.flatnonzero(association >= 0)
     base = matched.motions[BACKGROUND]
     if not len(inliers):

@@ -36,13 +36,6 @@ def to_prediction(pair: ScanPair, association: Ints, cluster: Ints, motions: Flo
     )
 
 
-def target_points(pair: ScanPair, association: Ints) -> Ints:
-    """(N,) target point of every source point, -1 none. association: (n_beams,) target beam of every source beam."""
-    point_of_beam = np.full(pair.target.n_beams + 1, OUTLIER)  # the last entry maps -1 to -1
-    point_of_beam[pair.target.beam] = np.arange(len(pair.target))
-    return point_of_beam[association[pair.source.beam]]
-
-
 def all_outliers(pair: ScanPair, motion: Floats = IDENTITY) -> PairPrediction:
     """The prediction if a scan is empty: all points are outliers."""
     nothing = np.full(len(pair.source), OUTLIER)

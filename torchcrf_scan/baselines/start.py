@@ -29,7 +29,7 @@ def match_start(model: JointScanCRF, pairs: Sequence[ScanPair], batch_size: int 
     for part in batches(pairs, batch_size):
         batch = ScanPairBatch.collate(part, reference.dtype).without_truth().to(reference.device)
         prediction = label_nearest(batch, model.initialise(batch))
-        found += [prediction.pair(b, pair) for b, pair in enumerate(part)]
+        found += prediction.of_pairs(part)
     return found
 
 
@@ -43,7 +43,7 @@ def match_static(pairs: Sequence[ScanPair], batch_size: int = 16) -> list[PairPr
         active = torch.ones(len(batch), 1, dtype=torch.bool)
         start = Start(motions, active, nearest_association(batch, motions, active), torch.zeros_like(batch.target))
         prediction = label_nearest(batch, start)
-        found += [prediction.pair(b, pair) for b, pair in enumerate(part)]
+        found += prediction.of_pairs(part)
     return found
 
 

@@ -81,7 +81,7 @@ def match_displaced(method: str, model: JointScanCRF, pairs: Sequence[tuple[Scan
     back = se2.inverse(offset)[:, None].expand_as(found.motions)
     uncertainty = found.uncertainty and turned(found.uncertainty, -offset[:, 0])
     found = replace(found, motions=se2.compose(back, found.motions), uncertainty=uncertainty)
-    return [found.pair(b, pair) for b, pair in enumerate(own)]
+    return found.of_pairs(own)
 
 
 def turned(uncertainty: Uncertainty, angle: Tensor) -> Uncertainty:

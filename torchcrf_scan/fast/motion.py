@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchcrf_scan.choices import MOTION_METRICS
 from torchcrf_scan.fast.robust import robust_weight
 from torchcrf_scan.inference.motion import ALONG, LEAST_DAMPING, PATIENCE
 from torchcrf_scan.loops.jit import Array, Booleans, Integers, kernel
@@ -15,7 +16,7 @@ from torchcrf_scan.loops.rigid import apply_to_rows, compose, motion_onto
 from torchcrf_scan.search.registration import PAIR_ROWS, gauss_newton_step
 
 POINT, LINE, GIVEN = 0, 1, 2  # metrics, in this order:
-METRICS = ("point", "line", "given")
+METRICS = tuple(MOTION_METRICS)
 
 
 class Members(NamedTuple):

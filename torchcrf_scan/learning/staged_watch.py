@@ -64,10 +64,10 @@ class StagedWatch:
         start = model.initialise(batch)
         rival = label_nearest(batch, start)
         for step in (0, self.last):
-            self.run.curves(summarise(score_pairs(some, [rival.pair(b, pair) for b, pair in enumerate(some)])), step, BASELINE)
+            self.run.curves(summarise(score_pairs(some, rival.of_pairs(some))), step, BASELINE)
         for step in sorted({*(look for look in LOOKS if look < self.last), self.last}):
             found = self.at(step, model)(batch, start)
-            self.run.curves(summarise(score_pairs(some, [found.pair(b, pair) for b, pair in enumerate(some)])), step)
+            self.run.curves(summarise(score_pairs(some, found.of_pairs(some))), step)
 
     def at(self, step: int, model: JointScanCRF) -> JointScanCRF:
         """The model with the weights of a step of both chains; those of the last one for a chain that was done before."""

@@ -22,7 +22,7 @@ SAFE_MATH = {"reassoc", "contract", "nsz", "arcp"}  # not those that assume fini
 
 
 def choose_processor(level: str) -> None:
-    """Of the code that this process makes; before numba is imported, which reads it then. Ends this process with its parent."""
+    """Chooses the processor that this process compiles for, before numba, which reads it, is imported; ends it with its parent."""
 
     def follow() -> None:
         parent = parent_process()
