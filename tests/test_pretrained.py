@@ -1,5 +1,6 @@
 """Saved models come back; what was saved long ago, damaged or made up is read with care."""
 
+import errno
 import json
 import os
 from collections.abc import Callable
@@ -32,6 +33,27 @@ def randomise(model: JointScanCRF) -> JointScanCRF:
 def saved(tmp_path: Path) -> Path:
     randomise(JointScanCRF(SMALL)).save_pretrained(tmp_path)
     return tmp_path
+
+
+@pytest.mark.parametrize("failing", range(3))
+def test_a_model_that_cannot_be_written_leaves_the_one_before(saved: Path, failing: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flush to the disk fails: of the settings, the weights, and the folder, in which both are by then."""
+    other, flushes = JointScanCRF(replace(SMALL, inference=InferenceConfig(clusters=5))), iter(range(3))
+
+    def flush(number: int) -> None:
+        if next(flushes) == failing:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = files_of(saved)
+    monkeypatch.setattr(os, "fsync", flush)
+    with pytest.raises(OSError, match="No space left"):
+        other.save_pretrained(saved)
+    assert (files_of(saved) == before) == (failing < 2)
+    assert JointScanCRF.from_pretrained(saved).config.inference.clusters == (5 if failing == 2 else 8)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def values_of(folder: Path) -> dict[str, Any]:

@@ -70,3 +70,9 @@ def test_a_folder_takes_the_place_of_a_folder_alone(tmp_path: Path) -> None:
         (path / "new").write_text("new")
     assert [of.name for of in folder.iterdir()] == ["new"]
     assert [of.name for of in tmp_path.iterdir()] == ["folder"]
+
+
+def test_a_full_disk_is_told_with_the_file_of_a_library_too(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match=r"No space left on device: '.*/run\.bag'"), whole_path(tmp_path / "run.bag"):
+        fail()
+    assert not list(tmp_path.iterdir())

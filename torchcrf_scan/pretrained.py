@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchcrf_scan.checks import from_values
 from torchcrf_scan.config import RUN_TIME, InferenceConfig, ModelConfig
 from torchcrf_scan.errors import TorchCRFScanError
-from torchcrf_scan.whole_file import write_whole
+from torchcrf_scan.whole_file import write_together
 
 PRETRAINED = "encoder"
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
@@ -40,15 +40,15 @@ def find_weights(name_or_path: str | Path) -> Path:
 
 
 def write_model(folder: Path, config: ModelConfig, state: Mapping[str, Tensor]) -> None:
-    """Writes a model, each file atomically; run-time settings (`config.RUN_TIME`) are not written."""
+    """Writes a model; run-time settings (`config.RUN_TIME`) are not written. Both files take their places when both are whole."""
     from safetensors.torch import save
 
     values = asdict(config)
     for name in RUN_TIME:
         del values["inference"][name]
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / CONFIG, json.dumps(values, indent=2) + "\n")
-    write_whole(folder / WEIGHTS, save({name: value.detach().cpu().contiguous() for name, value in state.items()}))
+    weights = save({name: value.detach().cpu().contiguous() for name, value in state.items()})
+    write_together({folder / CONFIG: json.dumps(values, indent=2) + "\n", folder / WEIGHTS: weights})
 
 
 def read_config(folder: Path, features: Mapping[str, Any], inference: Mapping[str, Any]) -> ModelConfig:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -26,17 +26,16 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         OSError: the file could not be written.
     """
     temporary = _beside(path)
-    try:
-        with temporary.open("xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename is None and error.errno is not None:  # of a write, e.g. a full disk
-            raise OSError(error.errno, error.strerror, str(path)) from error
-        raise
+    with _named(path):
+        try:
+            with temporary.open("xb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
     _sync(path.parent)
 
 
@@ -52,14 +51,26 @@ def whole_path(path: Path) -> Iterator[Path]:
     beside = _beside(path)
     beside.mkdir()
     written = beside / path.name
-    try:
-        yield written
-        if path.is_dir() and written.is_dir():  # only an empty folder can be replaced
-            os.replace(path, beside / f"{path.name}.old")
-        os.replace(written, path)
-    finally:
-        shutil.rmtree(beside)
+    with _named(path):
+        try:
+            yield written
+            if path.is_dir() and written.is_dir():  # only an empty folder can be replaced
+                os.replace(path, beside / f"{path.name}.old")
+            os.replace(written, path)
+        finally:
+            shutil.rmtree(beside)
     _sync(path.parent)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """An error of a write that does not tell its file, as that of a full disk, tells this one."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
 
 
 def move_whole(path: Path, target: Path) -> None:
@@ -90,8 +101,28 @@ def write_whole(path: Path, content: bytes | str) -> None:
     Raises:
         OSError: the file could not be written; its old content is kept.
     """
-    with whole_file(path) as file:
-        file.write(content.encode() if isinstance(content, str) else content)
+    write_together({path: content})
+
+
+def write_together(contents: Mapping[Path, bytes | str]) -> None:
+    """As `write_whole`, files of a folder that belong together: all are whole on the disk before the first takes its place.
+
+    Raises:
+        OSError: one of them could not be written; the old ones are kept.
+    """
+    beside = {path: _beside(path) for path in contents}
+    with ExitStack() as stack:
+        for path, temporary in beside.items():
+            stack.callback(temporary.unlink, missing_ok=True)
+            content = contents[path]
+            with _named(path), temporary.open("xb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+                file.flush()
+                os.fsync(file.fileno())
+        for path, temporary in beside.items():
+            os.replace(temporary, path)
+    for folder in {path.parent for path in contents}:
+        _sync(folder)
 
 
 def make_folder(option: str, folder: str | Path) -> Path:
