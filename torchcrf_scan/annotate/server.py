@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
 
 from bokeh.application import Application
@@ -51,6 +52,7 @@ def make_server(desk: Desk, port: int = 0) -> tuple[BaseServer, int]:
         pages.append(page)
         doc.on_session_destroyed(lambda _: pages.remove(page))
 
+    asyncio.set_event_loop(asyncio.new_event_loop())  # there is none unless one is set, from Python 3.14 on
     loop = IOLoop.current()
     sockets, port = bind_sockets(ADDRESS, port)
     names = [f"{ADDRESS}:{port}", f"localhost:{port}"]
