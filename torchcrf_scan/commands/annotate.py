@@ -75,8 +75,7 @@ def annotate(
         if not cases:
             raise TorchCRFScanError(f"files: expected pairs to annotate, got none{left_out}")
         server, port = make_server(Desk(cases, store, outlier_distance), port)
-        address = f"http://{ADDRESS}:{port}/"
-        pairs = f"{len(cases)} pair{'s' if len(cases) > 1 else ''}"
+        address, pairs = f"http://{ADDRESS}:{port}/", f"{len(cases)} pair{'s' if len(cases) > 1 else ''}"
         print(f"{pairs}, annotations in {output}, Ctrl-C ends{left_out}: {address}", flush=True)
         if open:
             webbrowser.open(address)
