@@ -35,6 +35,8 @@ def test_the_python_blocks_run_one_after_the_other(tmp_path: Path, monkeypatch: 
     assert abs(theta) < 0.01
     assert abs(x + 0.3) < 0.05
     assert abs(y) < 0.05
+    first, *_, last = namespace["losses"]
+    assert last < 0.9 * first  # the toy network has learned something
     told = re.search(r"# ((?:\d\.\d\d ?){12})$", blocks("python")[-1], re.MULTILINE)
     np.testing.assert_allclose(namespace["losses"], np.array(told[1].split(), float), atol=0.02)
     assert namespace["result"].status == "ok"

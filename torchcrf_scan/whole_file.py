@@ -26,7 +26,7 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         OSError: the file could not be written.
     """
     temporary = _beside(path)
-    with _named(path):
+    with naming(path):
         try:
             with temporary.open("xb") as file:
                 yield file
@@ -51,7 +51,7 @@ def whole_path(path: Path) -> Iterator[Path]:
     beside = _beside(path)
     beside.mkdir()
     written = beside / path.name
-    with _named(path):
+    with naming(path):
         try:
             yield written
             if path.is_dir() and written.is_dir():  # only an empty folder can be replaced
@@ -63,8 +63,8 @@ def whole_path(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """An error of a write that does not tell its file, as that of a full disk, tells this one."""
+def naming(path: Path) -> Iterator[None]:
+    """An error of a write that does not tell its file, as that of a full disk, tells this file or folder."""
     try:
         yield
     except OSError as error:
@@ -115,7 +115,7 @@ def write_together(contents: Mapping[Path, bytes | str]) -> None:
         for path, temporary in beside.items():
             stack.callback(temporary.unlink, missing_ok=True)
             content = contents[path]
-            with _named(path), temporary.open("xb") as file:
+            with naming(path), temporary.open("xb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)
                 file.flush()
                 os.fsync(file.fileno())

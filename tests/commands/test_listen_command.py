@@ -50,7 +50,7 @@ def test_listen_follows_a_robot(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 @pytest.mark.skipif(not LOGS.is_dir(), reason="the recordings are not here")
 def test_listen_keeps_up_with_a_recorded_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """At its own speed, 12.5 scans a second; the median latency, printed, is 25 ms on two idle cores."""
+    """At its own speed, 12.5 scans a second."""
     code, answers = follow(tmp_path, live_sender.replay, 100, LOGS / "datmo_overtakes.bag", "--report=0", "--waiting=20")
     last = capsys.readouterr().out.splitlines()[-1]
     print(last)
@@ -59,6 +59,7 @@ def test_listen_keeps_up_with_a_recorded_robot(tmp_path: Path, capsys: pytest.Ca
     assert found is not None
     assert int(found[1]) >= 97
     assert len(answers["scan_static"]) >= 97
+    assert float(found[3]) < 200  # 25 on two idle cores
 
 
 def test_wrong_options_are_named(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

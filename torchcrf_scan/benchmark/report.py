@@ -8,9 +8,11 @@ import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from torchcrf_scan.benchmark.limits import Rates
 from torchcrf_scan.benchmark.plan import WHOLE
@@ -36,7 +38,8 @@ def describe_machine() -> dict[str, Any]:
         "cpu_count": os.cpu_count(),
         "system": platform.platform(),
         "python": platform.python_version(),
-        **{name: _version(name) for name in ("torch", "numpy", "numba")},
+        "torch": torch.__version__,  # with its build, which its metadata may lack
+        **{name: version(name) for name in ("numpy", "numba")},
     }
 
 
@@ -46,13 +49,6 @@ def _processor() -> str:
     except OSError:
         return platform.processor()
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.processor())
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def _finite(row: Row) -> dict[str, Any]:

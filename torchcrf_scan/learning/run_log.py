@@ -18,6 +18,7 @@ from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.safe_names import file_name
 from torchcrf_scan.scan import PairPrediction, ScanPair
 from torchcrf_scan.viz.plots import plot_pair, save_figure
+from torchcrf_scan.whole_file import naming
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,11 +56,8 @@ def one_error(folder: Path) -> Iterator[None]:
 
     threading.excepthook = hook
     try:
-        yield
-    except OSError as error:
-        if error.filename is None and error.errno is not None:
-            raise OSError(error.errno, error.strerror, str(folder)) from error
-        raise
+        with naming(folder):
+            yield
     finally:
         threading.excepthook = before
 
