@@ -27,7 +27,7 @@ from torchcrf_scan.export import (
 from torchcrf_scan.inference.start import Start
 from torchcrf_scan.scan import Scan
 
-BEAMS = 31
+BEAMS = 16
 SETTINGS: dict[str, Any] = {"clusters": 3, "iterations": 1, "stop_early": False, "backend": "eager"}
 
 

@@ -1,14 +1,15 @@
 """A command that serves the page, in a process of its own."""
 
 import re
-import subprocess
-import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import pytest
-from serving import ROOT, Serve
+from forked import begin
+from serving import Serve, run_command
 
 from torchcrf_scan.data.pair_file import write_pair
 from torchcrf_scan.data.simulate import simulate_pairs
@@ -34,23 +35,24 @@ def pair_files(pairs: list[ScanPair], tmp_path_factory: pytest.TempPathFactory) 
 def serving(pair_files: Path) -> Iterator[Serve]:
     """Begins to serve the pairs and returns the process and the page's address; ends what has begun."""
     pytest.importorskip("bokeh", reason="the library bokeh is not installed (extra `annotate`)")
-    started: list[subprocess.Popen[str]] = []
+    started: list[ForkServerProcess] = []
 
-    def start(output: Path, *options: str, files: Path = pair_files, full: Path | None = None) -> tuple[subprocess.Popen[str], str]:
+    def start(output: Path, *options: str, files: Path = pair_files, full: Path | None = None) -> tuple[ForkServerProcess, str]:
         """full: a file; while it is there the disk is full."""
-        program = ["-m", "torchcrf_scan"] if full is None else [str(Path(__file__).with_name("full_disk.py")), str(full)]
-        command = [sys.executable, *program, "annotate", str(files), "--output", str(output), "--threads=1", *options]
-        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        told = output.with_name(f"{output.name}-{len(started)}.txt")
+        process = begin(run_command, ["annotate", str(files), "--output", str(output), "--threads=1", *options], told, full)
         started.append(process)
-        assert process.stdout is not None
-        found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
-        assert found is not None, process.poll()
-        return process, found.group()
+        while True:
+            found = re.search(r"http://127\.0\.0\.1:\d+/", told.read_text() if told.exists() else "")
+            if found is not None:
+                return process, found.group()
+            assert process.is_alive(), process.exitcode
+            time.sleep(0.05)
 
     yield start
     for process in started:
         process.kill()
-        process.communicate()
+        process.join()
 
 
 @pytest.fixture

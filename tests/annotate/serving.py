@@ -1,17 +1,35 @@
 """What a test gets that serves the page, and a window of it without a browser."""
 
-import subprocess
+import errno
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
 from torchcrf_scan.annotate.store import Store
+from torchcrf_scan.cli import main
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.scan import Annotation
 
 ROOT = Path(__file__).resolve().parents[2]
-Serve = Callable[..., tuple[subprocess.Popen[str], str]]  # of the output and more options: the process and the page's address
+Serve = Callable[..., tuple[ForkServerProcess, str]]  # of the output and more options: the process and the page's address
+
+
+def run_command(arguments: list[str], told: Path, full: Path | None) -> None:
+    """`torchcrf-scan`, in a process of its own. told: the file of its stdout; full: while this file is there the disk is full."""
+    sync = os.fsync
+
+    def fsync(number: int) -> None:
+        if full is not None and full.exists():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(number)
+
+    os.fsync = fsync
+    with told.open("w") as sys.stdout:
+        sys.exit(main(arguments))
 
 
 def saved_file(output: Path, name: str) -> Path:

@@ -170,7 +170,7 @@ def test_lasso_assign_drag_undo_kill_and_reopen(browser: Any, serve: Serve, tmp_
 
     # the server is killed and begins anew
     process.kill()
-    process.wait()
+    process.join()
     window = Window(browser, serve(output)[1])
     assert name == window.shown()
     assert window.points()[2] == colours
