@@ -6,6 +6,7 @@ callers, and neither to an object file of its own nor with the wrappers by which
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,7 @@ SAFE_MATH = {"reassoc", "contract", "nsz", "arcp"}  # not those that assume fini
 
 
 def choose_processor(level: str) -> None:
-    """Chooses the processor that this process compiles for, before numba, which reads it, is imported; ends it with its parent."""
+    """Makes this process one that compiles for a processor, before numba, which reads it, is imported; ends it with its parent."""
 
     def follow() -> None:
         parent = parent_process()
@@ -31,6 +32,7 @@ def choose_processor(level: str) -> None:
         os._exit(1)
 
     Thread(target=follow, daemon=True).start()
+    gc.set_threshold(200_000)  # the compiler makes millions of objects, and leaves few behind
     assert "numba" not in sys.modules
     os.environ |= {"NUMBA_CPU_NAME": level, "NUMBA_CPU_FEATURES": "", "NUMBA_DISABLE_JIT": "0"}
 
@@ -104,7 +106,16 @@ def _compile_as_the_loops_need() -> None:
     cpu.CPUContext.get_executable = lambda self, library, description, environment: [].append
     codegen.JITCodeLibrary._finalize_specific = lambda self: None
     codegen.JITCPUCodegen._add_module = lambda self, module: None
+    codegen.JITCodeLibrary._optimize_final_module = _inline
+    optimise = codegen.AOTCodeLibrary._optimize_final_module  # twice: again what the first time has inlined
+    codegen.AOTCodeLibrary._optimize_final_module = lambda self: [optimise(self), optimise(self)]
     _compile_kernels()
+
+
+def _inline(library: Any) -> None:
+    """Inlines what a kernel calls, and no more: the extension that it is linked to is optimised as a whole."""
+    passes, builder = library._codegen._module_pass_manager(opt=0, loop_vectorize=False, slp_vectorize=False, cost="cheap")
+    passes.run(library._final_module, builder)
 
 
 def _compile_kernels() -> None:
