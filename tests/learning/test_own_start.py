@@ -30,7 +30,7 @@ from torchcrf_scan.learning.staged_watch import StagedWatch
 from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.search.score import HypothesisScore
 
-LEARNING = LearningConfig(folds=2, negatives=5, batch_size=4, booster_examples=1_000)
+LEARNING = LearningConfig(folds=2, negatives=5, batch_size=4)
 PAPER = ModelConfig(
     start="paper",
     features=FeatureConfig(free_space=False, decisions=False, left_out=(), length_unit="metre", wrap_closed=False),
