@@ -12,7 +12,7 @@ LEVELS = ("x86-64-v2", "x86-64-v3", "generic")
 
 
 def prepare(*, levels: tuple[str, ...] | str = ()) -> int:
-    """Builds the machine code that is missing, in a minute or two; needs a C compiler.
+    """Builds the machine code that is missing, in a few minutes; needs a C compiler.
 
     Without it the first answers take seconds each, while the same is built in the background. To make a wheel that carries it:
     `torchcrf-scan prepare --levels [x86-64-v2,x86-64-v3]` in the source tree, then `pip wheel --no-deps .`; such a wheel is for

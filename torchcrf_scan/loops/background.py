@@ -55,7 +55,7 @@ class Background:
             self.is_over = True
             log.warning("no machine code, slow loops go on (seconds a pair): expected a C compiler (gcc or clang), got none")
             return
-        log.warning("no machine code yet: it is built in the background, in a minute or two; meanwhile a pair takes seconds")
+        log.warning("no machine code yet: it is built in the background, in a few minutes; meanwhile a pair takes seconds")
         command = [sys.executable, "-P", "-m", "torchcrf_scan.prepare"]  # -P: not what lies in the working directory
         paths = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
         environment = {**os.environ, "PYTHONPATH": paths, SWITCH: "0"}
