@@ -1,10 +1,14 @@
 """What the tests of the command line share: running a command, and what it leaves behind."""
 
+import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from torchcrf_scan.cli import main
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def run(*arguments: object) -> int:
@@ -23,3 +27,14 @@ def fail(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def load_main() -> Callable[[list[str]], int]:
+    """`main` of train.py, which is no part of the package."""
+    spec = importlib.util.spec_from_file_location("train", ROOT / "train.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    main: Callable[[list[str]], int] = module.main
+    return main

@@ -14,7 +14,6 @@ from torchcrf_scan.cli import main
 from torchcrf_scan.data.pair_file import read_pair
 from torchcrf_scan.scan import Annotation
 
-ROOT = Path(__file__).resolve().parents[2]
 Serve = Callable[..., tuple[ForkServerProcess, str]]  # of the output and more options: the process and the page's address
 
 

@@ -1,6 +1,5 @@
 """The command and its server: who is answered, what is refused, and what is told in one line."""
 
-import runpy
 import sys
 from contextlib import closing
 from http.client import HTTPConnection
@@ -8,7 +7,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from serving import ROOT, Serve, saved, shown, window
+from command_line import ROOT, load_main
+from serving import Serve, saved, shown, window
 
 from torchcrf_scan.cli import main
 
@@ -97,7 +97,7 @@ def test_a_log_is_annotated_and_learned_from(serve: Serve, tmp_path: Path, capsy
     assert "**Overview**" in capsys.readouterr().out
     tiny = ["--learning.max_steps=2", "--learning.booster_examples=200", "--learning.folds=0"]
     config = ["--config", str(ROOT / "configs" / "mine.yaml"), "--data.train", str(output), "--output", str(tmp_path / "run")]
-    assert runpy.run_path(str(ROOT / "train.py"))["main"]([*config, *tiny]) == 0
+    assert load_main()([*config, *tiny]) == 0
     assert (tmp_path / "run" / "model").is_dir()
 
 

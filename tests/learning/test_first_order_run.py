@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from command_line import load_main
 from support import events_of
-from test_trainer import load_main
 
 from torchcrf_scan.commands.experiment import experiment
 from torchcrf_scan.data.pair_file import write_pair

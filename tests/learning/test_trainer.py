@@ -1,13 +1,12 @@
 """One training run from the command to its run folder, on six pairs."""
 
-import importlib.util
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from command_line import ROOT, load_main
 from support import events_of
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.custom_scalar import layout_pb2
@@ -25,19 +24,8 @@ from torchcrf_scan.model import JointScanCRF
 from torchcrf_scan.names import ASSOCIATION_WEIGHTS, CLUSTERING_WEIGHTS
 from torchcrf_scan.scan import Scan, ScanPair
 
-ROOT = Path(__file__).resolve().parents[2]
 METHODS = ("joint", "CRF-Matching", "CRF-Clustering")
 SMALL = ("--data.pairs=6", "--data.sequences=3", "--learning.folds=2", "--model.features.stumps=15", "--learning.max_steps=40")
-
-
-def load_main() -> Callable[[list[str]], int]:
-    spec = importlib.util.spec_from_file_location("train", ROOT / "train.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    main: Callable[[list[str]], int] = module.main
-    return main
 
 
 @pytest.fixture(scope="module")
